@@ -1,11 +1,12 @@
-//! How good an estimate is: trajectories against ground truth, depth against true depth.
+//! Accuracy of an estimate: trajectories against ground truth, depth against true depth.
 //!
-//! The trajectory figures are those of the Python package `evo` on the same files: nearest stamps
-//! without interpolation (`association`), Umeyama alignment ([`mod@umeyama`]), absolute and relative
-//! errors ([`trajectory_error`]), epoch by epoch where there are several ([`epochs`]); [`normalized_error`] holds pose errors against their covariance. `windows` adds how the scale wanders, [`depth_error`] what the
-//! depth maps and their variances are good for, [`depth_modes`] what is wrong with the whole of one, [`start_error`] how far a start is off. Without any truth, [`map_consistency`] holds the keyframes
-//! against each other ([`shared_view`], [`patch_misfit`], [`depth_agreement`]), and [`grade`] says what
-//! that is worth.
+//! The trajectory figures are those of the Python package `evo` on the same files: nearest stamps without interpolation
+//! (`association`), Umeyama alignment ([`mod@umeyama`]), absolute and relative errors ([`trajectory_error`]), per epoch
+//! where there are several ([`epochs`]); [`normalized_error`] compares pose errors with their covariance. `windows`
+//! adds scale drift, [`depth_error`] the accuracy of the depth maps and their variances, [`depth_modes`] the errors
+//! common to a whole depth map, [`start_error`] the error of a start. Without ground truth, [`map_consistency`]
+//! compares the keyframes with each other ([`shared_view`], [`patch_misfit`], [`depth_agreement`]), and [`grade`] turns
+//! that into a grade.
 
 pub(crate) mod association;
 pub mod depth_agreement;
@@ -32,22 +33,22 @@ use crate::slam::evaluation::umeyama::{AlignmentError, TrajectoryAlignment};
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::trajectory::StampedPose;
 
-/// Largest difference of two stamps that are taken for the same instant: 0.02 s, less than half a
-/// frame at 20 Hz and the habit of the field's tools.
+/// Largest difference of two stamps that count as the same instant: 0.02 s, less than half a frame at 20 Hz and
+/// customary among the field's tools.
 pub const MAX_DIFFERENCE_NANOS: i64 = 20_000_000;
 
 /// Why two trajectories cannot be compared.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum EvaluationError {
-    /// A stamp or pose that is no number; a broken file or a diverged estimate.
+    /// A non-finite stamp or pose: a broken file or a diverged estimate.
     #[error("pose {index} of the {which} is not finite: remove it or fix its source")]
     NotFinite {
         /// `estimate` or `ground truth`.
         which: &'static str,
-        /// Its place in the trajectory, from 0.
+        /// Index in the trajectory, from 0.
         index: usize,
     },
-    /// The trajectories share no time.
+    /// Too few poses have ground truth near their stamps.
     #[error(
         "only {found} of {estimated} poses have ground truth within {max_difference_secs} s (at least {needed} are needed): check that both use the same clock, or allow a larger difference"
     )]
@@ -61,29 +62,29 @@ pub enum EvaluationError {
         /// Largest difference of stamps that was allowed, seconds.
         max_difference_secs: f64,
     },
-    /// The positions do not fix the alignment.
+    /// The positions do not determine the alignment.
     #[error(transparent)]
     Alignment(#[from] AlignmentError),
     /// None of several epochs can be compared.
     #[error("none of {epochs} epochs can be compared; epoch {longest}, the longest: {reason}")]
     NoEpoch {
-        /// How many there are.
+        /// Number of epochs.
         epochs: usize,
-        /// The one with the most poses.
+        /// The epoch with the most poses.
         longest: u32,
-        /// What is wrong with it.
+        /// Why that epoch cannot be compared.
         reason: Box<EvaluationError>,
     },
 }
 
-/// Errors of a trajectory against the ground truth. Lengths are in the ground truth's unit.
+/// Errors of a trajectory against ground truth. Lengths are in the ground truth's unit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrajectoryEvaluation {
-    /// Which poses were compared: (index in the estimate, index in the ground truth), in order of time.
+    /// The poses that were compared: (index in the estimate, index in the ground truth), in order of time.
     pub pairs: Vec<(usize, usize)>,
-    /// `truth_from_estimate`, by the alignment that was asked for.
+    /// `truth_from_estimate`, by the requested alignment.
     pub alignment: Sim3,
-    /// Position errors after alignment, one for each match.
+    /// Position errors after alignment, one per match.
     pub absolute: Vec<f64>,
     /// Statistics of [`Self::absolute`]: the ATE.
     pub ate: ErrorStatistics,
@@ -101,7 +102,7 @@ pub struct TrajectoryEvaluation {
     pub window_scales: Vec<(usize, f64)>,
     /// Largest over smallest of [`Self::window_scales`]; `None` below two windows.
     pub window_scale_ratio: Option<f64>,
-    /// Median position error of windows of 30 matches, each aligned by itself.
+    /// Median position error over windows of 30 matches, each aligned separately.
     pub window_error: Option<f64>,
 }
 
@@ -180,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn drifting_scale_shows_in_the_windows_and_not_in_their_errors() {
+    fn scale_drift_shows_in_the_window_scales_and_not_in_the_window_errors() {
         let truth = path(300);
         let mut estimate = truth.clone();
         for (i, pose) in estimate.iter_mut().enumerate() {
@@ -195,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_input_is_an_error_and_never_a_panic() {
+    fn arbitrary_input_is_an_error_and_never_a_panic() {
         let truth = path(40);
         let evaluate = |estimate: &[StampedPose], truth: &[StampedPose]| {
             evaluate_trajectory(estimate, truth, TrajectoryAlignment::Sim3, MAX_DIFFERENCE_NANOS)

@@ -1,11 +1,11 @@
-//! A frame as the algorithms see it: one rectified grey image with its stamp and sequence.
+//! The frame type of the algorithms: one rectified grey image with its stamp and sequence.
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// A borrowed rectified grey image, whether it lies in shared memory or in a buffer.
 #[derive(Debug, Clone, Copy)]
 pub struct FrameView<'a> {
-    /// Number of the frame at its source; gaps are seen by it.
+    /// Frame number assigned by the source; gaps reveal lost frames.
     pub sequence: u64,
     /// Middle of the exposure, nanoseconds (CLOCK_MONOTONIC live, the recording's clock otherwise).
     pub capture_nanos: i64,
@@ -26,7 +26,7 @@ impl<'a> FrameView<'a> {
         Self { sequence, capture_nanos, exposure_nanos: 0, width, height, pixels }
     }
 
-    /// Whether the pixels are as many as the size says.
+    /// Whether the number of pixels matches the size.
     pub fn is_consistent(&self) -> bool {
         self.width.checked_mul(self.height) == Some(self.pixels.len())
     }

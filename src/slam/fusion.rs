@@ -1,14 +1,14 @@
-//! One surface out of the depth of all keyframes: what people open as a point cloud.
+//! Fuses the depth of all keyframes into one surface, to be opened as a point cloud.
 //!
-//! Keyframes overlap, so that their points together are the same surface ten times with ten errors. Each point is compared
-//! with the depth that other keyframes have at its pixel (Merrell et al. 2007, *Real-time visibility-based fusion of depth
-//! maps*): depths that agree are averaged by their variances; a point through which several others see is removed. What
-//! remains is gathered in cells of space (the size of a cell follows the distance and the standard deviation), points
-//! closer than a cell or without company are removed, and the rest is put in an order of which any beginning shows all of
-//! the map.
+//! Keyframes overlap, so their points together show the same surface ten times with ten errors. Each point is compared
+//! with the depth that other keyframes have at its pixel (Merrell et al. 2007, *Real-time visibility-based fusion of
+//! depth maps*): depths that agree are averaged by their variances; a point that several others see through is removed.
+//! The rest is gathered in cells of space (the size of a cell follows the distance and the standard deviation), points
+//! closer than a cell or without company are removed, and the remaining ones are ordered so that any prefix shows the
+//! whole map.
 //!
-//! The same keyframes give the same bits for any number of threads. Memory beyond the keyframes: 58 kB for each of 640 × 480
-//! pixels, 64 bytes for each cell, and the points of sixteen keyframes at a time.
+//! The same keyframes give the same bits for any number of threads. Memory beyond the keyframes: 58 kB per 640 × 480
+//! keyframe, 64 bytes per cell, and the points of sixteen keyframes at a time.
 
 mod grid;
 mod neighbours;
@@ -39,21 +39,21 @@ const BATCH: usize = 16;
 /// A point of the map's surface.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SurfacePoint {
-    /// Where it is, map units.
+    /// Position, map units.
     pub position: [f32; 3],
-    /// Unit normal of the surface, towards the camera that sees it best; zero where it is not known.
+    /// Unit normal of the surface, towards the camera with the lowest variance; zero where unknown.
     pub normal: [f32; 3],
     /// Brightness, 0 to 255.
     pub grey: u8,
     /// Standard deviation of the position along the ray from that camera, map units.
     pub sigma: f32,
-    /// Keyframes whose depth agrees, that camera's included.
+    /// Number of keyframes whose depth agrees, including that camera's.
     pub keyframes: u8,
 }
 
-/// The surface of keyframes that have one unit and place in common (one epoch), in an order of which any beginning shows
-/// all of it: the first `n` points are the best `n` to show. `progress` is called with how many keyframes are done, of how
-/// many.
+/// Fuses keyframes that share one unit and coordinate frame (one epoch) into a surface, ordered so that any prefix
+/// shows all of it: the first `n` points are the best `n` to show. `progress` is called with the number of keyframes
+/// done and their total.
 pub fn fuse(
     keyframes: &[&Keyframe],
     params: &FusionParams,
@@ -98,7 +98,7 @@ fn seen_by(
     gathered.collect()
 }
 
-/// What all keyframes say of a point together.
+/// A point after fusion with all other keyframes.
 struct Fused {
     inverse_depth: f64,
     variance: f64,
@@ -142,17 +142,17 @@ fn fused(
     if is_seen_through || is_alone {
         return None;
     }
-    // Depth is carried from keyframe to keyframe: what agrees is not independent.
+    // Depth is propagated from keyframe to keyframe: depths that agree are not independent.
     Some(Fused { inverse_depth: sum / weight, variance: least, keyframes: agreeing })
 }
 
-/// Whether enough of the depth around a point is that of the same surface: beside a step in depth, and where a pixel was
-/// matched wrongly, it is not.
+/// Whether enough of the depth around a point lies on the same surface: next to a step in depth, and where a pixel was
+/// mismatched, it does not.
 fn is_supported(view: &View<'_>, point: &DepthPoint, params: &FusionParams) -> bool {
-    /// Pixels to each side that are looked at.
+    /// Pixels considered to each side.
     const RADIUS: usize = 3;
-    /// Standard deviations of both by which depths of one surface differ, and a share of the depth besides: a surface that
-    /// is seen flatly.
+    /// Standard deviations of both by which depths of one surface may differ, and a share of the depth in addition: for
+    /// surfaces seen at a shallow angle.
     const TOLERANCE: f64 = 1.5;
     const FLOOR: f64 = 0.01;
     let (d, variance) = (f64::from(point.inverse_depth), f64::from(point.variance));

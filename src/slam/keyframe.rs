@@ -1,4 +1,4 @@
-//! A keyframe: a frame with a semi-dense depth map and a place in the world.
+//! A keyframe: a frame with a semi-dense depth map and a pose in the world.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
 use crate::slam::places::Description;
 
-/// One pixel with depth, as it goes over the wire.
+/// One pixel with depth, as sent over the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[cfg_attr(feature = "service", derive(FromBytes, IntoBytes, Immutable, KnownLayout))]
 #[repr(C)]
@@ -31,8 +31,8 @@ pub struct DepthPoint {
 /// Most points of one keyframe: bounds the message and the tracker's memory.
 pub const MAX_KEYFRAME_POINTS: usize = 100_000;
 
-/// What counts in the distance of a camera from a keyframe (Engel, Schöps, Cremers 2014, §3.4, with the share of
-/// points in view).
+/// Weights of the distance of a camera from a keyframe (Engel, Schöps, Cremers 2014, §3.4, with the share of points in
+/// view).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DistanceWeights {
     /// w_d: a translation of 1/w_d of the mean depth alone is a distance of 1.
@@ -48,15 +48,15 @@ impl Default for DistanceWeights {
 }
 
 impl DistanceWeights {
-    /// `(w_d ‖t‖ d̄)² + (w_u (1 − usage))²` of a camera `translation` mean depths away that sees a share `usage` of
-    /// the keyframe's points. Beyond 1 a new keyframe is asked for.
+    /// `(w_d ‖t‖ d̄)² + (w_u (1 − usage))²` of a camera `translation` mean depths away that sees a share `usage` of the
+    /// keyframe's points. Beyond 1 a new keyframe is requested.
     pub fn distance(&self, translation: f64, usage: f64) -> f64 {
         let from_translation = self.translation * translation;
         let from_usage = self.usage * (1.0 - usage);
         from_translation * from_translation + from_usage * from_usage
     }
 
-    /// The translation, in mean depths, that alone is a `distance`: nothing further away is nearer than that.
+    /// The translation, in mean depths, that alone makes a `distance`: nothing further away has a smaller one.
     pub fn reach(&self, distance: f64) -> f64 {
         distance.sqrt() / self.translation.max(f64::MIN_POSITIVE)
     }
@@ -65,47 +65,47 @@ impl DistanceWeights {
 /// Whether the map behind a keyframe can be trusted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MapState {
-    /// Depth is proven: poses on it are claimed.
+    /// Depth is established: poses on it are claimed.
     Established,
     /// The map contradicted itself: poses on it are `Lost` until a new keyframe or epoch.
     Rejected,
 }
 
-/// A keyframe as the tracker and every subscriber see it: self-contained.
+/// A keyframe as the tracker and every subscriber receive it: self-contained.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Keyframe {
-    /// Its id, counted up in the order of creation.
+    /// Its id, increasing in the order of creation.
     pub keyframe_id: u64,
-    /// Life of the map it belongs to.
+    /// Epoch of the map that it belongs to.
     pub epoch: u32,
-    /// Counts up with every change of the depth or the pose of any keyframe.
+    /// Increases with every change of the depth or the pose of any keyframe.
     pub revision: u64,
-    /// Sequence of the frame it was made from.
+    /// Sequence of the frame it was created from.
     pub sequence: u64,
     /// Stamp of that frame, nanoseconds.
     pub capture_nanos: i64,
     /// Whether its depth can be trusted.
     pub map_state: MapState,
-    /// Where odometry has it, with its unit: never jumps while it is active.
+    /// Its pose in the world, with its unit: never jumps while it is active.
     pub world_from_keyframe: Sim3,
-    /// Where the map has it, with its unit: moves with every correction of the map.
+    /// Its pose in the map, with its unit: moves with every correction of the map.
     pub map_from_keyframe: Sim3,
-    /// How often the map had been corrected by then.
+    /// Number of corrections of the map at that time.
     pub map_revision: u64,
     /// Intrinsics of its image.
     pub intrinsics: Intrinsics,
-    /// Rectified grey image, `width * height` bytes; shared by all who keep it.
+    /// Rectified grey image, `width * height` bytes; shared between copies.
     pub image: Arc<[u8]>,
-    /// How uncertain the errors are that all of its depth shares.
+    /// Covariance of the errors common to all of its depth.
     pub mode_covariance: ModeCovariance,
-    /// How uncertain its place in the map is, relative to the keyframes that held those it was estimated with; of the
-    /// first one of an epoch zero.
+    /// Covariance of its pose in the map, relative to the keyframes that were held when it was estimated; zero for the
+    /// first one of an epoch.
     pub place_covariance: PlaceCovariance,
-    /// Whether its depth was observed again in the keyframes around it, which is done once.
+    /// Whether its depth was observed again in the surrounding keyframes, which is done once.
     pub is_refined: bool,
     /// Pixels with depth in row-major order, at most [`MAX_KEYFRAME_POINTS`].
     pub points: Vec<DepthPoint>,
-    /// What its image looks like, by which it is found: the mapper's alone, which describes it once.
+    /// Description of its image, for place recognition: only in the mapper, which computes it once.
     pub description: Option<Arc<Description>>,
 }
 
@@ -137,7 +137,7 @@ impl Keyframe {
         }
     }
 
-    /// Where the map has it, and how uncertain that is.
+    /// Its pose in the map, with the covariance.
     pub fn uncertain_place(&self) -> UncertainPlace {
         let Self { map_from_keyframe, place_covariance: covariance, .. } = *self;
         UncertainPlace { map_from_keyframe, covariance }
@@ -151,12 +151,12 @@ pub struct KeyframePose {
     pub keyframe_id: u64,
     /// Revision of its depth.
     pub revision: u64,
-    /// Where the map has it, with its unit.
+    /// Its pose in the map, with its unit.
     pub map_from_keyframe: Sim3,
 }
 
 impl KeyframePose {
-    /// Of a keyframe.
+    /// The pose of a keyframe.
     pub fn of(keyframe: &Keyframe) -> Self {
         let Keyframe { keyframe_id, revision, map_from_keyframe, .. } = *keyframe;
         Self { keyframe_id, revision, map_from_keyframe }
@@ -168,7 +168,7 @@ mod tests {
     use super::DistanceWeights;
 
     #[test]
-    fn each_weight_is_what_its_share_of_the_limit_says() {
+    fn each_weight_alone_reaches_the_limit_at_its_share() {
         let weights = DistanceWeights { translation: 2.0, usage: 4.0 };
         assert_eq!(weights.distance(0.5, 1.0), 1.0);
         assert_eq!(weights.distance(0.0, 0.75), 1.0);

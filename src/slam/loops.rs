@@ -1,10 +1,10 @@
-//! Loops: a keyframe sees a place again that it was not estimated with, and the map is moved so that both agree (Engel,
+//! Loops: a keyframe revisits a place with which it was not estimated, and the map is moved so that both agree (Engel,
 //! Schöps, Cremers 2014, §3.5–3.6).
 //!
-//! [`Loops::plan`] chooses who is compared with whom, by what keyframes look like (`likeness`); [`Loops::run`] is the
-//! recipe: pairs are measured both ways (`graph::constraint`), one that the drift of the chain allows (`chain`) is confirmed
-//! by a second, independent pair (`search`), and then the pose graph of the epoch is solved (`closure`). It is slow and
-//! made in the background on copies; [`Loops::begin`] and [`Loops::take_closure`] are where it meets the map.
+//! [`Loops::plan`] chooses the keyframes to compare by their appearance (`likeness`); [`Loops::run`] is the recipe:
+//! pairs are measured in both directions (`graph::constraint`), one that the drift of the chain allows (`chain`) is
+//! confirmed by a second, independent pair (`search`), and then the pose graph of the epoch is solved (`closure`). It
+//! is slow and runs in the background on copies; [`Loops::begin`] and [`Loops::take_closure`] access the map.
 
 mod chain;
 mod closure;
@@ -36,12 +36,12 @@ pub use known::{KnownLoops, Link};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LoopParams {
-    /// Keyframes that look most alike with which one that has settled is compared; 0 looks for no loops.
+    /// Number of most similar keyframes that a settled one is compared with; 0 disables the search for loops.
     pub num_candidates: usize,
-    /// Fewest features that two keyframes that are compared show in the same arrangement.
+    /// Fewest features in the same arrangement for two keyframes to be compared.
     pub min_features: f32,
-    /// By how much the variance of a keyframe's place against those it was estimated with is larger than the estimate says:
-    /// what the window's model does not know adds up along a chain.
+    /// Factor on the variance of a keyframe's pose relative to those it was estimated with: effects outside the
+    /// window's model add up along a chain.
     pub drift_inflation: f64,
 }
 
@@ -60,61 +60,61 @@ impl LoopParams {
     }
 }
 
-/// What a search came to.
+/// The outcome of a search.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum SearchFate {
-    /// No candidate is the same place; why the first one is not.
+    /// No candidate is the same place; the reason for the first one.
     Refused(Refusal),
-    /// One may be: it is to be confirmed.
+    /// A candidate is plausible and is to be confirmed.
     Proposed,
-    /// One would be, but is further off than the map can have drifted: χ²₇ of that.
+    /// A candidate would be the same place, but is further off than the map can have drifted: χ²₇ of that.
     AgainstDrift(f64),
-    /// No second pair says the same.
+    /// No second pair confirms it.
     Unconfirmed,
-    /// Together with the loops before it contradicts the map.
+    /// Together with the earlier loops it contradicts the map.
     Inconsistent,
-    /// The map has it so already: it holds from now on.
+    /// The map already agrees with it: it is kept as a constraint.
     Held,
-    /// The map is moved.
+    /// The map is corrected.
     Closed,
     /// Two epochs are joined.
     Joined,
 }
 
-/// A search that is over.
+/// Report of a finished search.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SearchReport {
-    /// The keyframe that was looked for in others.
+    /// The keyframe that was searched.
     pub keyframe_id: u64,
-    /// The candidate that most came of, or else the one most alike.
+    /// The candidate that was to be confirmed, or else the most similar one.
     pub other: Option<u64>,
-    /// Features that the most alike shows in the same arrangement.
+    /// Features that the most similar candidate shows in the same arrangement.
     pub likeness: f32,
     /// Pairs that were measured.
     pub compared: u32,
-    /// What came of it.
+    /// Its outcome.
     pub fate: SearchFate,
-    /// The last pair that passed for itself, with `j_from_i`: ids of i and j.
+    /// The last pair whose measurement was accepted: ids of i and j, with `j_from_i`.
     pub measured: Option<(u64, u64, Sim3)>,
 }
 
-/// Two keyframes to be compared, with what is believed of them.
+/// Two keyframes to be compared, with the initial similarity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Pair {
     i: u64,
     j: u64,
-    /// Of a search only the rotation is known.
+    /// In a search only its rotation counts.
     j_from_i: Sim3,
 }
 
-/// What is to be done next.
+/// The next thing to do.
 #[derive(Debug, Clone)]
 enum Stage {
-    /// Pairs are measured from nothing.
+    /// Measure pairs without an initial pose.
     Search,
-    /// Pairs are measured that could confirm a loop.
+    /// Measure pairs that could confirm a loop.
     Confirm(Box<Link>),
-    /// A correction was not taken: the graph is solved again.
+    /// A correction was not applied: solve the graph again.
     Close { num_newest: usize },
 }
 
@@ -123,17 +123,17 @@ struct Plan {
     of: u64,
     stage: Stage,
     pairs: Vec<Pair>,
-    /// Features that the most alike have in common.
+    /// Features shared with the most similar candidate.
     likeness: f32,
 }
 
-/// A plan with copies of what it needs.
+/// A plan with copies of the keyframes it needs.
 #[derive(Debug, Clone)]
 struct Job {
     plan: Plan,
-    /// In the order of their ids.
+    /// In order of their ids.
     keyframes: Vec<Keyframe>,
-    /// All of the map without their depth, in the order of their ids.
+    /// All keyframes of the map without their depth, in order of their ids.
     nodes: Vec<Keyframe>,
 }
 
@@ -147,36 +147,36 @@ impl Job {
     }
 }
 
-/// The keyframe with an id, of some in the order of theirs.
+/// The keyframe with an id, in a list ordered by id.
 fn find(keyframes: &[Keyframe], id: u64) -> Option<&Keyframe> {
     let place = keyframes.binary_search_by_key(&id, |keyframe| keyframe.keyframe_id).ok()?;
     keyframes.get(place)
 }
 
-/// The search for loops and what it has found.
+/// The search for loops and its results.
 #[derive(Debug, Clone)]
 pub struct Loops {
     params: LoopParams,
     intrinsics: Intrinsics,
     likeness: Likeness,
-    /// By keyframe those that it was estimated with, older and newer.
+    /// By keyframe: those that it was estimated with, older and newer.
     partners: BTreeMap<u64, BTreeSet<u64>>,
-    /// First keyframes of epochs, joined ones too: those on either side see different things.
+    /// First keyframes of epochs, including joined ones: those on either side have different views.
     epoch_starts: BTreeSet<u64>,
-    /// Shared with who keeps it.
+    /// Shared with the map that stores it.
     known: Arc<KnownLoops>,
     plan: Option<Plan>,
     job: Option<Box<Job>>,
     closure: Option<Closure>,
     report: Option<SearchReport>,
-    /// Of the search that is being made: see the report.
+    /// Of the search in progress: see the report.
     measured: Option<(u64, u64, Sim3)>,
-    /// The keyframe that was searched last and whose candidates are no places of it.
+    /// The keyframe searched last, if none of its candidates shows its place.
     fruitless: Option<u64>,
 }
 
 impl Loops {
-    /// Without any yet, for keyframes of `intrinsics`.
+    /// Without any loops yet, for keyframes of `intrinsics`.
     pub fn new(intrinsics: Intrinsics, params: LoopParams) -> Self {
         Self {
             params,
@@ -194,12 +194,12 @@ impl Loops {
         }
     }
 
-    /// Whether loops are looked for.
+    /// Whether loops are searched for.
     pub fn is_on(&self) -> bool {
         self.params.num_candidates > 0
     }
 
-    /// Takes the descriptions of the keyframes of a map, in the order of their ids, that are new since the last time.
+    /// Takes the descriptions of the keyframes of a map, in order of their ids, that are new since the last call.
     pub fn offer(&mut self, keyframes: &[Keyframe]) {
         if self.is_on() {
             let new = self.likeness.offer(keyframes);
@@ -209,9 +209,9 @@ impl Loops {
         }
     }
 
-    /// A keyframe was estimated with others, all but those in `held` free.
+    /// Records that a keyframe was estimated with others, all free except those in `held`.
     pub fn note_estimate(&mut self, newest: u64, others: &[u64], held: &[u64]) {
-        /// Keyframes before it that its place is estimated against, beside those that are held.
+        /// Preceding keyframes that its pose counts as estimated against, in addition to those held.
         const NUM_BEFORE: usize = 2;
         if !self.is_on() {
             return;
@@ -219,7 +219,7 @@ impl Loops {
         for &other in others {
             self.partners.entry(newest).or_default().insert(other);
             self.partners.entry(other).or_default().insert(newest);
-            // Those that are free with it meet all that hold it.
+            // The free ones are estimated against all that are held.
             if !held.contains(&other) {
                 for &of in held {
                     self.partners.entry(other).or_default().insert(of);
@@ -232,8 +232,8 @@ impl Loops {
         Arc::make_mut(&mut self.known).held_by.insert(newest, against);
     }
 
-    /// Continues with what a mapper before knew of the loops of these keyframes. Those that it had searched are only found,
-    /// and so are those of which it is not known what they were estimated with.
+    /// Continues from the loops that an earlier mapper stored for these keyframes. Those already searched, and those
+    /// without a record of what they were estimated with, can be found but are not searched.
     pub fn take_up(&mut self, known: Arc<KnownLoops>, keyframes: &[Keyframe]) {
         self.partners = known.partners();
         self.known = known;
@@ -243,15 +243,15 @@ impl Loops {
         }
     }
 
-    /// What is known, to be kept with the map.
+    /// The loops found so far, to be stored with the map.
     pub fn known(&self) -> &Arc<KnownLoops> {
         &self.known
     }
 
-    /// Chooses what is done next. `known` are the keyframes with image and depth, in the order of their ids; those from
+    /// Plans the next step. `known` are the keyframes with image and depth, in order of their ids; those from
     /// `num_settled` on may still move.
     pub fn plan(&mut self, known: &[u64], num_settled: usize) {
-        /// Keyframes after one that was no loop which see the same, and are not searched.
+        /// Keyframes after a fruitless one that have the same view, and are not searched.
         const PAUSE: usize = 2;
         if self.plan.is_some() || !self.is_on() {
             return;
@@ -276,9 +276,9 @@ impl Loops {
         }
     }
 
-    /// Keyframes that look like one and were not estimated with it or with those around it.
+    /// Keyframes similar to one that were estimated neither with it nor with those around it.
     fn candidates(&self, known: &[u64], place: usize) -> Vec<(Pair, f32)> {
-        /// Keyframes before and after one that see what it sees.
+        /// Keyframes before and after one that share its view.
         const AROUND: usize = 7;
         let of = known[place];
         let mut is_open = vec![true; known.len()];
@@ -304,7 +304,7 @@ impl Loops {
         alike.into_iter().map(pair).collect()
     }
 
-    /// Takes copies of what the plan needs; false where there is nothing to do.
+    /// Copies what the plan needs; returns false where there is nothing to do.
     pub fn begin(&mut self, map: &Map) -> bool {
         let Some(plan) = self.plan.take() else { return false };
         let ids: BTreeSet<u64> = plan.pairs.iter().flat_map(|pair| [pair.i, pair.j]).collect();
@@ -317,7 +317,7 @@ impl Loops {
         true
     }
 
-    /// Does what was begun; false where nothing was.
+    /// Runs the prepared job; returns false where there is none.
     pub fn run(&mut self) -> bool {
         let Some(job) = self.job.take() else { return false };
         let of = job.plan.of;
@@ -337,17 +337,17 @@ impl Loops {
         true
     }
 
-    /// What the last search came to: told once.
+    /// Takes the report of the last search.
     pub fn take_report(&mut self) -> Option<SearchReport> {
         self.report.take()
     }
 
-    /// How the map is to be moved: told once.
+    /// Takes the closure to be applied to the map.
     pub fn take_closure(&mut self) -> Option<Closure> {
         self.closure.take()
     }
 
-    /// The map has changed meanwhile, so that it was not moved: that is made again.
+    /// Plans to solve the graph again, as the map changed meanwhile and the closure was not applied.
     pub fn repeat_closure(&mut self) {
         let Some(closure) = self.closure.take() else { return };
         let num_newest = confirmations(closure.join.is_none()) + 1;
@@ -362,7 +362,7 @@ impl Loops {
     }
 }
 
-/// Pairs that must say what a loop says, within an epoch and between two.
+/// Number of pairs that must confirm a loop, within an epoch and between two.
 fn confirmations(is_one_epoch: bool) -> usize {
     if is_one_epoch { 1 } else { 2 }
 }

@@ -1,9 +1,9 @@
-//! The map: keyframes, where they are, and what is changed in them from outside the frame path.
+//! The map: keyframes, their poses, and corrections from outside the frame path.
 //!
-//! **Places.** A keyframe is placed twice: `map_from_keyframe` is the best estimate and moves when the map is
-//! corrected; `world_from_keyframe` is where the odometry has it and never jumps. Both are similarities whose
-//! scale is the keyframe's unit; it is chosen when the keyframe is made (mean inverse depth 1) and changes by
-//! a [`Correction`] only. A frame is kept relative to its keyframe, in the keyframe's unit, and so follows it.
+//! **Poses.** A keyframe has two poses: `map_from_keyframe` is the best estimate and moves when the map is corrected;
+//! `world_from_keyframe` is that of the odometry and never jumps. Both are similarities whose scale is the keyframe's
+//! unit; it is chosen when the keyframe is created (mean inverse depth 1) and changed only by a [`Correction`]. A frame
+//! is stored relative to its keyframe, in the keyframe's unit, and so follows it.
 
 use std::sync::Arc;
 
@@ -17,27 +17,26 @@ use crate::slam::loops::known::KnownLoops;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::PlaceCovariance;
 
-/// All keyframes of all epochs, with their depth. Each epoch has a scale and a drift of its own.
+/// All keyframes of all epochs, with their depth. Each epoch has its own scale and drift.
 #[derive(Debug, Clone, Default)]
 pub struct Map {
     /// Keyframes in order of creation.
     pub keyframes: Vec<Keyframe>,
-    /// Frames that were aligned again after they were tracked, in the order of their sequence.
+    /// Frames that were aligned again after tracking, in order of their sequence.
     pub frames: Vec<FramePlace>,
-    /// Of a map that is complete: points of the joint estimation.
+    /// Points of the joint estimation; only in a complete map.
     pub confirmed: Vec<ConfirmedPoint>,
-    /// Loops, and what the keyframes say of each other without them.
+    /// Loops, and the keyframes that each keyframe was estimated against.
     pub loops: Arc<KnownLoops>,
-    /// How often the map was corrected.
+    /// Number of corrections of the map.
     pub revision: u64,
-    /// Of a checkpoint: the keyframe that was active.
+    /// The keyframe that was active; only in a checkpoint.
     pub active: Option<u64>,
-    /// Numbers of epochs from here on are given by nobody yet; see
-    /// [`Mapper::checkpoint`](crate::slam::mapper::Mapper::checkpoint).
+    /// First epoch number that is still free; see [`Mapper::checkpoint`](crate::slam::mapper::Mapper::checkpoint).
     pub free_epoch: u32,
 }
 
-/// Where a frame is relative to its keyframe.
+/// The pose of a frame relative to its keyframe.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FramePlace {
     /// Its sequence.
@@ -48,69 +47,68 @@ pub struct FramePlace {
     pub keyframe_from_camera: SE3,
 }
 
-/// Where a frame is after it was aligned again.
+/// The pose of a frame after it was aligned again.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlacedFrame {
     /// Its sequence.
     pub sequence: u64,
     /// Its keyframe.
     pub keyframe_id: u64,
-    /// Where it is, in the unit of the map.
+    /// Its pose, in the unit of the map.
     pub keyframe_from_camera: SE3,
 }
 
-/// A point that several keyframes were estimated from jointly.
+/// A point estimated jointly from several keyframes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ConfirmedPoint {
-    /// The keyframe that it was chosen in.
+    /// The keyframe in which it was selected.
     pub keyframe_id: u64,
     /// Column of its pixel there, level 0.
     pub u: u16,
     /// Row.
     pub v: u16,
-    /// Keyframes that agreed with it when it was last estimated, beside its own.
+    /// Keyframes, other than its own, that agreed with it in the last estimate.
     pub confirmations: u32,
-    /// 1/z along the keyframe's optical axis, one over the keyframe's unit.
+    /// 1/z along the keyframe's optical axis, 1/keyframe units.
     pub inverse_depth: f32,
     /// Brightness of its pixel, grey levels.
     pub intensity: f32,
 }
 
-/// Depth of a keyframe as it is known better.
+/// Refined depth of a keyframe.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RefinedDepth {
     /// The keyframe.
     pub keyframe_id: u64,
-    /// Revision of the keyframe that it was refined from.
+    /// Revision of the keyframe that was refined.
     pub of_revision: u64,
-    /// Its points, inverse depth in one over the keyframe's unit.
+    /// Its points, inverse depth in 1/keyframe units.
     pub points: Vec<DepthPoint>,
 }
 
-/// What is known better of the map than before: new places, depth and epochs, all at once.
+/// An improved estimate of the map: new poses, depth and epochs, all at once.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Correction {
-    /// Keyframes that move, each once. One that the map does not hold any more is left out.
+    /// Keyframes that move, each once. One that the map no longer contains is ignored.
     pub keyframes: Vec<KeyframeCorrection>,
-    /// Epochs that turn out to be parts of others; done first.
+    /// Epochs found to be parts of others; applied first.
     pub joins: Vec<EpochJoin>,
-    /// Length of the unit that the map had in the one that it has now, where that changes for all of it alike:
-    /// odometry keeps its own.
+    /// Length of the map's old unit in the new one, if that changes for the whole map: odometry keeps its own.
     pub unit: Option<f64>,
 }
 
-/// A keyframe's new place and depth. Frames that were tracked on it keep their pose relative to it, in its unit.
+/// A keyframe's new pose and depth. Frames that were tracked on it keep their pose relative to it, in its unit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KeyframeCorrection {
     /// The keyframe.
     pub keyframe_id: u64,
-    /// Its new place and unit.
+    /// Its new pose and unit.
     pub map_from_keyframe: Sim3,
-    /// What its inverse depths, in its unit, are multiplied by.
+    /// Factor on its inverse depths, in its unit.
     pub depth: LogPlane,
-    /// How uncertain the errors are that all of its depth shares after that; as before where nothing is said.
+    /// Covariance of the errors common to its depth after that; `None` leaves it unchanged.
     pub modes: Option<ModeCovariance>,
-    /// How uncertain the new place is; where nothing is said, as the old one was.
+    /// Covariance of the new pose; `None` transports that of the old one.
     pub place: Option<PlaceCovariance>,
 }
 
@@ -126,26 +124,26 @@ pub struct LogPlane {
     pub per_y: f64,
 }
 
-/// One epoch that is part of another: its keyframes go over into that.
+/// One epoch that is part of another: its keyframes move to the other epoch.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct EpochJoin {
     /// The epoch that ends.
     pub epoch: u32,
-    /// The epoch whose number stays.
+    /// The epoch that remains.
     pub into: u32,
-    /// Where the first one's map lies in the second one's.
+    /// Transforms the first one's map into the second one's.
     pub into_from_epoch: Sim3,
 }
 
-/// Why a correction is refused as a whole.
+/// Why a correction is rejected as a whole.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum CorrectionError {
-    /// A place is not finite, or its scale not positive.
+    /// A pose is not finite, or its scale not positive.
     #[error(
         "the correction of keyframe {0} is not a similarity, or its depth factor is not finite"
     )]
     Keyframe(u64),
-    /// The same of an epoch.
+    /// The same for an epoch.
     #[error("the join of epoch {0} is not a similarity, or joins the epoch to itself")]
     Join(u32),
     /// The unit is not finite, or not positive.
@@ -154,7 +152,7 @@ pub enum CorrectionError {
 }
 
 impl KeyframeCorrection {
-    /// A new place alone.
+    /// A new pose only.
     pub fn of_place(keyframe_id: u64, map_from_keyframe: Sim3) -> Self {
         let depth = LogPlane::default();
         Self { keyframe_id, map_from_keyframe, depth, modes: None, place: None }
@@ -173,7 +171,7 @@ impl LogPlane {
         *self == Self::default()
     }
 
-    /// Applies it to points of a keyframe.
+    /// Applies it to the points of a keyframe.
     pub fn apply(&self, intrinsics: &Intrinsics, points: &mut [DepthPoint]) {
         if self.is_identity() {
             return;
@@ -186,7 +184,7 @@ impl LogPlane {
     }
 
     fn is_sane(&self) -> bool {
-        /// No correction of depth is by more than a factor of e³ = 20; more is a broken solution.
+        /// No depth is corrected by more than a factor of e³ = 20; more is a broken solution.
         const LARGEST: f64 = 3.0;
         [self.offset, self.per_x, self.per_y].iter().all(|of| of.abs() <= LARGEST)
     }
@@ -223,17 +221,17 @@ impl Map {
         self.keyframes.iter().filter(|keyframe| !keyframe.image.is_empty()).count()
     }
 
-    /// Its place in the list: the newest are asked for most.
+    /// Index of a keyframe in the list, searched from the end: the newest are queried most.
     pub fn index_of(&self, keyframe_id: u64) -> Option<usize> {
         self.keyframes.iter().rposition(|keyframe| keyframe.keyframe_id == keyframe_id)
     }
 
-    /// `map_from_camera` of a frame that is known relative to a keyframe.
+    /// `map_from_camera` of a frame whose pose relative to a keyframe is given.
     pub fn place(&self, keyframe_id: u64, keyframe_from_camera: &SE3) -> Option<SE3> {
         Some(self.get(keyframe_id)?.map_from_keyframe.place(keyframe_from_camera))
     }
 
-    /// Keeps where a frame is that was aligned again.
+    /// Stores the pose of a frame that was aligned again.
     pub fn place_frame(&mut self, placed: &PlacedFrame) {
         let Some(keyframe) = self.get(placed.keyframe_id) else { return };
         let mut keyframe_from_camera = placed.keyframe_from_camera;
@@ -246,15 +244,15 @@ impl Map {
         }
     }
 
-    /// Where a frame is, if it was aligned again.
+    /// The pose of a frame, if it was aligned again.
     pub fn frame(&self, sequence: u64) -> Option<&FramePlace> {
         let place = self.frames.binary_search_by_key(&sequence, |known| known.sequence).ok()?;
         self.frames.get(place)
     }
 
-    /// Keyframes of `epoch` with image and depth that a camera sees points of, by their places in the list, with
-    /// the share of their points that is in view: all whose distance from the camera is below `max_distance`
-    /// of their mean depths.
+    /// Keyframes of `epoch` with image and depth of which a camera sees points, by their indices in the list, with the
+    /// share of their points that is in view: all whose distance from the camera is below `max_distance` of their mean
+    /// depths.
     pub fn seen_from(
         &self,
         epoch: u32,
@@ -275,8 +273,8 @@ impl Map {
         )
     }
 
-    /// Moves what a correction moves; the revisions of what changed become `revision`. Numbers are checked first,
-    /// so that it is done as a whole or not at all.
+    /// Applies a correction; the revisions of changed keyframes become `revision`. Values are checked first, so that it
+    /// is applied as a whole or not at all.
     pub fn correct(
         &mut self,
         correction: &Correction,
@@ -287,7 +285,7 @@ impl Map {
             for keyframe in self.keyframes.iter_mut().filter(|k| k.epoch == join.epoch) {
                 keyframe.epoch = join.into;
                 keyframe.map_from_keyframe = join.into_from_epoch * keyframe.map_from_keyframe;
-                // The join itself is taken for exact.
+                // The join itself is taken to be exact.
                 keyframe.place_covariance =
                     keyframe.place_covariance.transported(&join.into_from_epoch);
                 keyframe.revision = revision;
@@ -311,7 +309,7 @@ impl Map {
         Ok(())
     }
 
-    /// Gives a keyframe depth that is known better, as `revision` of it.
+    /// Replaces the depth of a keyframe by refined depth, with `revision`.
     pub fn refine(&mut self, refined: RefinedDepth, revision: u64) {
         let Some(index) = self.index_of(refined.keyframe_id) else { return };
         let keyframe = &mut self.keyframes[index];
@@ -319,8 +317,8 @@ impl Map {
         keyframe.revision = revision;
     }
 
-    /// Takes image and depth from the oldest keyframes until the rest fit into `max_bytes`; their poses
-    /// stay. The newest keeps everything.
+    /// Drops image and depth of the oldest keyframes until the rest fit into `max_bytes`; their poses stay. The newest
+    /// keeps everything.
     pub fn forget_depth_beyond(&mut self, max_bytes: usize) {
         let mut bytes: usize = self.keyframes.iter().map(depth_bytes).sum();
         let Some((_, older)) = self.keyframes.split_last_mut() else { return };
@@ -334,10 +332,10 @@ impl Map {
     }
 }
 
-/// How a camera sees a keyframe.
+/// A camera's view of a keyframe.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct View {
-    /// Where it stands, in the keyframe's unit.
+    /// Its pose, in the keyframe's unit.
     pub keyframe_from_camera: SE3,
     /// Share of the keyframe's points in view, 0 to 1.
     pub usage: f64,
@@ -349,22 +347,22 @@ impl Keyframe {
         !self.image.is_empty() && !self.points.is_empty()
     }
 
-    /// Whether it can be compared with others: it has image and depth that can be trusted.
+    /// Whether it can be compared with others: it has image and depth, and its map is established.
     pub fn is_usable(&self) -> bool {
         self.has_depth() && self.map_state == MapState::Established
     }
 
-    /// The same without image, its description and points.
+    /// A copy without image, description and points.
     pub fn without_depth(&self) -> Self {
         Self { image: Arc::default(), points: Vec::new(), description: None, ..*self }
     }
 
-    /// Gives up image, its description and points; the pose stays.
+    /// Drops image, description and points; the pose stays.
     pub fn forget_depth(&mut self) {
         (self.image, self.points, self.description) = (Arc::default(), Vec::new(), None);
     }
 
-    /// Share of its points that a camera sees; every so many are enough for a share.
+    /// Share of its points that a camera sees; a sample of them is enough.
     pub fn usage(&self, keyframe_from_camera: &SE3) -> f64 {
         const STRIDE: usize = 16;
         let Intrinsics { width, height, .. } = self.intrinsics;

@@ -1,18 +1,18 @@
-//! Errors of depth that are common to a whole keyframe, and how uncertain they are.
+//! Errors of depth that are common to a whole keyframe, and their covariance.
 //!
-//! A relative error of inverse depth is split into what is common, δd/d = φᵀm with φ = (X, Y, ln d), X and Y the
-//! ray's coordinates, and the rest, which each point has for itself. m is tilt along columns, tilt along rows and
-//! relief. A constant error is not among them: it is the keyframe's unit, which no image shows.
+//! A relative error of inverse depth is split into the common part, δd/d = φᵀm with φ = (X, Y, ln d), X and Y the ray's
+//! coordinates, and the rest, which is independent for each point. m is tilt along columns, tilt along rows and relief.
+//! A constant error is not among them: it is the keyframe's unit, which no image shows.
 
 use nalgebra::{Matrix3, Vector3};
 
-/// Common errors of a keyframe's depth.
+/// Number of common errors of a keyframe's depth.
 pub const NUM_MODES: usize = 3;
 
-/// Largest standard deviation of a mode that is accepted: an error of ten times the depth for each unit of φ.
+/// Largest accepted standard deviation of a mode: an error of ten times the depth per unit of φ.
 const MAX_STD_DEV: f64 = 10.0;
 
-/// Standard deviation of a mode of which nothing is known: depth may be twice or half as much across the image.
+/// Standard deviation of an unknown mode: depth may be twice or half as much across the image.
 const IGNORANCE: f64 = 1.0;
 
 /// Covariance P of the common errors of a keyframe's relative inverse depth: tilt along columns, along rows, relief.
@@ -22,26 +22,26 @@ pub struct ModeCovariance {
 }
 
 impl ModeCovariance {
-    /// Without any common error.
+    /// No common error.
     pub const ZERO: Self = Self { upper_triangle: [0.0; 6] };
 
-    /// With these standard deviations, independent of each other.
+    /// Independent modes with these standard deviations.
     pub fn of_std_devs([column, row, relief]: [f64; NUM_MODES]) -> Self {
         Self { upper_triangle: [column * column, 0.0, 0.0, row * row, 0.0, relief * relief] }
     }
 
-    /// Of depth of which nothing is known.
+    /// Covariance for unknown depth.
     pub fn unknown() -> Self {
         Self::of_std_devs([IGNORANCE; NUM_MODES])
     }
 
-    /// Of a symmetric matrix.
+    /// From a symmetric matrix.
     pub fn of(matrix: &Matrix3<f64>) -> Self {
         let m = |i, j| 0.5 * (matrix[(i, j)] + matrix[(j, i)]);
         Self { upper_triangle: [m(0, 0), m(0, 1), m(0, 2), m(1, 1), m(1, 2), m(2, 2)] }
     }
 
-    /// Of a symmetric matrix that came out of sums: what is beyond all sense is taken for complete ignorance.
+    /// From a symmetric matrix that is a sum: an implausible one becomes complete ignorance.
     pub fn bounded(matrix: &Matrix3<f64>) -> Self {
         let covariance = Self::of(matrix);
         let largest = covariance.std_devs().max();
@@ -51,9 +51,9 @@ impl ModeCovariance {
         }
     }
 
-    /// Of its upper triangle, row by row; `None` where that is no covariance, or one beyond all sense.
+    /// From its upper triangle, row by row; `None` where that is not a covariance, or an implausible one.
     pub fn from_upper_triangle(upper_triangle: [f64; 6]) -> Option<Self> {
-        /// Eigenvalues may be this share of the largest below zero, by rounding.
+        /// By rounding, eigenvalues may be negative by this share of the largest.
         const TOLERANCE: f64 = 1e-9;
         let covariance = Self { upper_triangle };
         if !upper_triangle.iter().all(|x| x.is_finite()) {
@@ -65,7 +65,7 @@ impl ModeCovariance {
         is_one.then_some(covariance)
     }
 
-    /// Of depth whose relief is off by `error` and stays so.
+    /// The covariance for depth whose relief has a permanent error of `error`.
     pub fn with_relief_error(&self, error: f64) -> Self {
         let mut matrix = self.matrix();
         matrix[(2, 2)] += error * error;
@@ -94,7 +94,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_no_covariance_is_refused() {
+    fn an_invalid_covariance_is_refused() {
         let good = ModeCovariance::of_std_devs([0.1, 0.2, 0.3]);
         assert_eq!(ModeCovariance::from_upper_triangle(good.upper_triangle()), Some(good));
         assert!((good.std_devs() - Vector3::new(0.1, 0.2, 0.3)).norm() < 1e-12);
@@ -107,7 +107,7 @@ mod tests {
             [f64::NAN, 0.0, 0.0, 1.0, 0.0, 1.0],
             [1.0, 0.0, 0.0, f64::INFINITY, 0.0, 1.0],
             [-1.0, 0.0, 0.0, 1.0, 0.0, 1.0],
-            // Correlated by more than 1.
+            // A correlation above 1.
             [1.0, 2.0, 0.0, 1.0, 0.0, 1.0],
             [1e9, 0.0, 0.0, 1.0, 0.0, 1.0],
         ] {

@@ -1,7 +1,7 @@
 //! The whole algorithm without processes: images in, poses and a map out, on the caller's thread.
 //!
 //! [`Odometry`] calls tracker, mapper and joint estimation as `semidense replay` does and gives the same bits. The
-//! processes exist to do the same by a deadline.
+//! processes exist to do the same within deadlines.
 
 use serde::{Deserialize, Serialize};
 
@@ -20,16 +20,16 @@ use crate::slam::window::Window;
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct OdometryParams {
-    /// How frames are tracked.
+    /// Tuning of the tracker.
     pub tracker: TrackerParams,
-    /// How depth and keyframes are made.
+    /// Tuning of depth and keyframes.
     pub mapper: MapperParams,
 }
 
 /// Why there is no odometry for a camera.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum OdometryError {
-    /// Size and intrinsics that no camera has.
+    /// Invalid size or intrinsics.
     #[error(
         "size {} × {} and intrinsics {}, {}, {}, {} are not those of a camera",
         .0.width, .0.height, .0.fx, .0.fy, .0.cx, .0.cy
@@ -65,19 +65,19 @@ pub enum OdometryError {
 /// ```
 ///
 /// Depth is estimated on rayon's pool: the global one, or another around `push` (`ThreadPool::install`). A frame takes
-/// milliseconds, one after which keyframes are estimated jointly some 40 ms more.
+/// milliseconds, one that is followed by a joint estimate of keyframes some 40 ms more.
 #[derive(Debug)]
 pub struct Odometry {
     params: OdometryParams,
     tracker: Tracker,
     mapper: Mapper,
-    /// Memory of the reference that the tracker gave back.
+    /// Memory of the reference that the tracker returned.
     spare: Option<Box<Reference>>,
     estimate: Option<Estimate>,
     frames: u64,
 }
 
-/// A joint estimate that is made and waits for its frame.
+/// A finished joint estimate that waits for its frame.
 #[derive(Debug)]
 struct Estimate {
     window: Box<Window>,
@@ -103,9 +103,9 @@ impl Odometry {
         })
     }
 
-    /// Takes in the next frame and gives its pose. Sequence and stamp count up; a frame of another size is not tracked.
-    /// Until the camera has moved sideways by some per cent of the distance of what it sees there is no map, and poses
-    /// are `Initializing`.
+    /// Tracks the next frame and returns its pose. Sequence and stamp must increase; a frame of another size is not
+    /// tracked. Until the camera has moved sideways by some per cent of the distance of the scene there is no map, and
+    /// poses are `Initializing`.
     pub fn push(&mut self, frame: &FrameView<'_>) -> PoseEstimate {
         let pose = self.tracker.track(frame, &mut |_| true);
         let mut outcome = self.mapper.step(frame, &pose, None, &mut || {});
@@ -113,7 +113,7 @@ impl Odometry {
         self.frames += 1;
         outcome.keyframe_changed |= self.let_in().keyframe_changed;
         self.begin();
-        // One that is due with its own frame.
+        // An estimate may be due with its own frame.
         outcome.keyframe_changed |= self.let_in().keyframe_changed;
         if outcome.needs_publishing() {
             self.hand_on_keyframe();
@@ -121,7 +121,7 @@ impl Odometry {
         pose
     }
 
-    /// After the last frame: estimates all keyframes once more and refines their depth. More frames may follow.
+    /// Estimates all keyframes once more and refines their depth, after the last frame. More frames may follow.
     pub fn finish(&mut self) {
         self.end_estimate();
         while let Some(window) = self.mapper.begin_last_search() {
@@ -137,7 +137,7 @@ impl Odometry {
         self.hand_on_keyframe();
     }
 
-    /// All keyframes, in the order in which they were made: image, inverse depth with variance, place in the map.
+    /// All keyframes, in order of creation: image, inverse depth with variance, pose in the map.
     pub fn keyframes(&self) -> &[Keyframe] {
         &self.mapper.map().keyframes
     }
@@ -147,12 +147,12 @@ impl Odometry {
         self.mapper.keyframe()
     }
 
-    /// Keyframes, and where each frame was when its keyframe had been estimated.
+    /// The keyframes, and the pose of each frame once its keyframe was estimated.
     pub fn map(&self) -> &Map {
         self.mapper.map()
     }
 
-    /// Makes a joint estimate where one is due. It enters the map later, as where it is made beside the frames.
+    /// Makes a joint estimate where one is due. It enters the map later, as if made in parallel with the frames.
     fn begin(&mut self) {
         if self.estimate.is_none()
             && let Some(window) = self.mapper.begin_adjustment(false)
@@ -176,7 +176,7 @@ impl Odometry {
         }
     }
 
-    /// Lets the estimate in, unless the map that it was made of is no more.
+    /// Applies the estimate, unless the map it was made from has changed.
     fn end_estimate(&mut self) -> StepOutcome {
         let Some(estimate) = self.estimate.take() else { return StepOutcome::default() };
         let is_same_map = self.mapper.keyframe().is_some_and(|active| {
@@ -191,7 +191,7 @@ impl Odometry {
         StepOutcome::default()
     }
 
-    /// Gives the tracker the mapper's keyframe, in the memory of the one before.
+    /// Hands the mapper's keyframe to the tracker, in the memory of the previous one.
     fn hand_on_keyframe(&mut self) {
         let Some(keyframe) = self.mapper.keyframe() else { return };
         let new = || Box::new(Reference::new(self.params.tracker.reference.clone()));

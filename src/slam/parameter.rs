@@ -1,4 +1,4 @@
-//! How the parameters of an algorithm say that a value is out of range.
+//! Errors for parameters of an algorithm that are out of range.
 
 use std::fmt::{Debug, Display};
 use std::ops::RangeInclusive;
@@ -7,7 +7,7 @@ use std::ops::RangeInclusive;
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{key} = {value}: must be {allowed}")]
 pub struct ParameterError {
-    /// The key as it stands in the configuration, dotted below the algorithm's table.
+    /// The key as written in the configuration, dotted below the algorithm's table.
     pub key: String,
     /// The value that was given.
     pub value: String,

@@ -1,13 +1,13 @@
-//! How uncertain the place of a keyframe in the map is, and what that makes of the poses on it.
+//! Covariance of a keyframe's pose in the map, and of the poses of cameras on it.
 //!
-//! The place is `map_from_keyframe` with its unit s. Its errors are (ξ, λ): the left increment of its rigid part,
+//! The pose is `map_from_keyframe` with its unit s. Its errors are (ξ, λ): the left increment of its rigid part,
 //! `exp(ξ) map_from_keyframe`, ξ = (translation, rotation) in map units and radians, and the unit s e^λ. All left
-//! increments turn about the one origin of the map, so that what a keyframe errs by its cameras err by too. With Δ from
-//! the keyframe to the camera, in the map, and ε the left increment of `current_from_keyframe`:
+//! increments rotate about the one origin of the map, so the cameras of a keyframe share its error. With Δ from the
+//! keyframe to the camera, in the map, and ε the left increment of `current_from_keyframe`:
 //! ```text
 //! ξ_camera = ξ + (λ Δ, 0) − Ad(map_from_camera) diag(s, s, s, 1, 1, 1) ε
 //! ```
-//! A position p errs by δp = ξ_t + ξ_ω × p. The first keyframe of an epoch is the gauge and errs by nothing.
+//! The error of a position p is δp = ξ_t + ξ_ω × p. The first keyframe of an epoch is the gauge and has no error.
 
 use nalgebra::{Matrix6, SMatrix, SVector, Vector3};
 
@@ -15,7 +15,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::pose::UNKNOWN_VARIANCE;
 
-/// What the place of a keyframe errs by: six numbers of its pose, one of its unit.
+/// Number of errors of a keyframe's pose: six of its rigid part, one of its unit.
 pub const PLACE_ERRORS: usize = 7;
 /// Entries of the upper triangle of their covariance.
 pub const PLACE_ENTRIES: usize = 28;
@@ -23,37 +23,37 @@ pub const PLACE_ENTRIES: usize = 28;
 /// A covariance of (ξ, λ).
 pub type PlaceMatrix = SMatrix<f64, PLACE_ERRORS, PLACE_ERRORS>;
 
-/// Variances of a place of which nothing is known: of its pose as of a pose that is not claimed, of the logarithm of
-/// its unit a factor of e. None is larger.
+/// Variances of an unknown pose: for the rigid part those of a pose that is not claimed, for the logarithm of the unit
+/// a factor of e. No variance is larger.
 const IGNORANCE: [f64; PLACE_ERRORS] = {
     let mut variances = [UNKNOWN_VARIANCE; PLACE_ERRORS];
     variances[PLACE_ERRORS - 1] = 1.0;
     variances
 };
 
-/// By rounding, variances may be this share of the largest below zero, and so may eigenvalues of the correlations.
+/// By rounding, variances may be negative by this share of the largest, and so may eigenvalues of the correlations.
 const ROUNDING: f64 = 1e-9;
 
-/// Covariance of the errors (ξ, λ) of a keyframe's place.
+/// Covariance of the errors (ξ, λ) of a keyframe's pose.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PlaceCovariance {
     upper_triangle: [f64; PLACE_ENTRIES],
 }
 
-/// A keyframe's place and how uncertain it is.
+/// A keyframe's pose and its covariance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UncertainPlace {
-    /// Where the map has it, with its unit.
+    /// Its pose in the map, with its unit.
     pub map_from_keyframe: Sim3,
-    /// Of that.
+    /// Its covariance.
     pub covariance: PlaceCovariance,
 }
 
 impl PlaceCovariance {
-    /// Of a place that is exact.
+    /// The covariance of an exact pose.
     pub const ZERO: Self = Self { upper_triangle: [0.0; PLACE_ENTRIES] };
 
-    /// Of a place of which nothing is known.
+    /// The covariance of an unknown pose.
     pub fn unknown() -> Self {
         Self::of(&PlaceMatrix::from_diagonal(&IGNORANCE.into()))
     }
@@ -64,27 +64,27 @@ impl PlaceCovariance {
         Self { upper_triangle: std::array::from_fn(|_| entries.next().map_or(0.0, mean)) }
     }
 
-    /// Of a symmetric matrix that came out of sums. What by rounding alone has a variance below zero is taken for exact,
-    /// and what is less sure than ignorance for as sure as that, its correlations as they are; what is no covariance
-    /// even so is taken for complete ignorance.
+    /// From a symmetric matrix that is a sum. A variance that is negative by rounding alone becomes zero, one beyond
+    /// ignorance is clipped to it with its correlations unchanged; a matrix that is not a covariance even so becomes
+    /// complete ignorance.
     pub fn bounded(matrix: &PlaceMatrix) -> Self {
         let covariance = Self::of(matrix);
         let matrix = covariance.matrix();
         let variances = matrix.diagonal();
         let least = -ROUNDING * variances.max();
-        // Rows and columns times the same: what was a covariance stays one.
+        // Rows and columns are scaled alike: a covariance stays one.
         let factors = SVector::<f64, PLACE_ERRORS>::from_fn(|k, _| match variances[k] {
             variance if (least..0.0).contains(&variance) => 0.0,
             variance if variance > IGNORANCE[k] => (IGNORANCE[k] / variance).sqrt(),
             _ => 1.0,
         });
         let mut within = scaled(&matrix, &factors);
-        // Rounding may leave it above.
+        // Rounding may leave it above the bound.
         (0..PLACE_ERRORS).for_each(|k| within[(k, k)] = within[(k, k)].min(IGNORANCE[k]));
         Self::from_upper_triangle(Self::of(&within).upper_triangle).unwrap_or_else(Self::unknown)
     }
 
-    /// Of its upper triangle, row by row; `None` where that is no covariance, or one beyond all sense.
+    /// From its upper triangle, row by row; `None` where that is not a covariance, or an implausible one.
     pub fn from_upper_triangle(upper_triangle: [f64; PLACE_ENTRIES]) -> Option<Self> {
         let covariance = Self { upper_triangle };
         let matrix = covariance.matrix();
@@ -113,12 +113,12 @@ impl PlaceCovariance {
         matrix
     }
 
-    /// Whether a variance is as large as any may be.
+    /// Whether a variance is at its upper bound.
     fn is_at_bound(&self) -> bool {
         self.matrix().diagonal().iter().zip(IGNORANCE).any(|(&variance, bound)| variance >= bound)
     }
 
-    /// The same in the map that `by` makes of this one.
+    /// The covariance after the map is transformed by `by`.
     pub fn transported(&self, by: &Sim3) -> Self {
         let by = transport(by);
         Self::bounded(&(by * self.matrix() * by.transpose()))
@@ -131,21 +131,21 @@ impl UncertainPlace {
         Self { map_from_keyframe, covariance: PlaceCovariance::ZERO }
     }
 
-    /// Covariance of the left increment of `map_from_camera`, map units and radians, of a camera that stands at
+    /// Covariance of the left increment of `map_from_camera`, map units and radians, of a camera at
     /// `keyframe_from_camera` with this covariance of the left increment of `current_from_keyframe`, both in the
-    /// keyframe's unit. Where the place is beyond all numbers nothing is known.
+    /// keyframe's unit. Where the result is not finite the pose is unknown.
     pub fn of_camera(&self, keyframe_from_camera: &SE3, covariance: &Matrix6<f64>) -> Matrix6<f64> {
         let sum = self.with_camera(keyframe_from_camera, covariance);
         let mut pose = sum.fixed_view::<6, 6>(0, 0).into_owned();
         if !pose.iter().all(|x| x.is_finite()) {
             return Matrix6::from_diagonal_element(UNKNOWN_VARIANCE);
         }
-        // By rounding alone a variance is below zero.
+        // Only by rounding is a variance negative.
         (0..6).for_each(|k| pose[(k, k)] = pose[(k, k)].max(0.0));
         pose
     }
 
-    /// The place of a keyframe that is made where that camera stands, its unit as uncertain as this one's.
+    /// The covariance of a keyframe created at that camera, its unit as uncertain as this one's.
     pub fn of_next(
         &self,
         keyframe_from_camera: &SE3,
@@ -164,7 +164,7 @@ impl UncertainPlace {
         sum
     }
 
-    /// What it makes of the errors of something that stands at `position` in the map and is exact relative to it.
+    /// The covariance of something at `position` in the map that is exact relative to this keyframe.
     fn at(&self, position: &Vector3<f64>) -> PlaceMatrix {
         let mut by_place = PlaceMatrix::identity();
         let lever = position - self.map_from_keyframe.rigid.translation;
@@ -172,17 +172,17 @@ impl UncertainPlace {
         by_place * self.covariance.matrix() * by_place.transpose()
     }
 
-    /// Of a keyframe that goes where its leader goes, from `was` to `is`: the leader's, and what lies between them,
-    /// which is what it was uncertain by beyond the leader.
+    /// Covariance of a keyframe that follows its leader from `was` to `is`: the leader's, plus the uncertainty between
+    /// them, which is what its own had beyond the leader's.
     pub fn following(&self, was: &Self, is: &Self) -> PlaceCovariance {
         let moved = is.map_from_keyframe * was.map_from_keyframe.inverse();
         let position = moved * self.map_from_keyframe.rigid.translation;
-        // A variance at its bound was larger: the difference of two of which one was clipped, and the other not or
-        // elsewhere, is nothing that lies between them.
+        // A variance at its bound was larger: if only one of two was clipped, or they were clipped elsewhere, their
+        // difference is not the uncertainty between them.
         if was.covariance.is_at_bound() {
             return PlaceCovariance::bounded(&is.at(&position));
         }
-        // Unknown for a reason of its own: its leader does not change that.
+        // Unknown for a separate reason: its leader does not change that.
         if self.covariance.is_at_bound() {
             return self.covariance;
         }
@@ -199,24 +199,24 @@ fn entries() -> impl Iterator<Item = (usize, usize)> {
     (0..PLACE_ERRORS).flat_map(|row| (row..PLACE_ERRORS).map(move |column| (row, column)))
 }
 
-/// What (ξ, λ) become in the map that `by` makes of this one.
+/// Transforms (ξ, λ) into the map that `by` makes of this one.
 pub fn transport(by: &Sim3) -> PlaceMatrix {
     let mut matrix = PlaceMatrix::identity();
     matrix.fixed_view_mut::<6, 6>(0, 0).copy_from(&by.rigid_adjoint());
     matrix
 }
 
-/// Standard deviations; 1 of what is exact.
+/// Standard deviations; 1 for exact entries.
 fn deviations(covariance: &PlaceMatrix) -> SVector<f64, PLACE_ERRORS> {
     covariance.diagonal().map(|variance| if variance > 0.0 { variance.sqrt() } else { 1.0 })
 }
 
-/// Rows and columns times `by`.
+/// Rows and columns multiplied by `by`.
 fn scaled(matrix: &PlaceMatrix, by: &SVector<f64, PLACE_ERRORS>) -> PlaceMatrix {
     PlaceMatrix::from_fn(|row, column| matrix[(row, column)] * by[row] * by[column])
 }
 
-/// A symmetric matrix without what is negative in it, its entries measured in `unit`.
+/// The positive semi-definite part of a symmetric matrix, its entries measured in `unit`.
 fn positive_part(matrix: &PlaceMatrix, unit: &SVector<f64, PLACE_ERRORS>) -> PlaceMatrix {
     let mut eigen = scaled(matrix, &unit.map(|of| 1.0 / of)).symmetric_eigen();
     eigen.eigenvalues.apply(|value| *value = value.max(0.0));
@@ -229,7 +229,7 @@ mod tests {
 
     use super::*;
 
-    /// Small enough that products of errors do not show.
+    /// Small enough for products of errors to vanish.
     const STEP: f64 = 1e-6;
 
     fn place() -> Sim3 {
@@ -240,7 +240,7 @@ mod tests {
         SE3::exp(&Vector6::new(0.2, -0.3, 0.4, 0.1, 0.2, -0.3))
     }
 
-    /// Errors of a place, of a size that goes with `salt`.
+    /// Errors of a pose, of a size that depends on `salt`.
     fn errors(salt: f64) -> SVector<f64, PLACE_ERRORS> {
         SVector::from_fn(|row, _| (salt + 1.3 * row as f64).sin())
     }
@@ -249,13 +249,13 @@ mod tests {
         PlaceCovariance::bounded(&(errors * errors.transpose()))
     }
 
-    /// The place that errs by so much.
+    /// The pose with this error.
     fn off(place: &Sim3, by: &SVector<f64, PLACE_ERRORS>) -> Sim3 {
         let pose = SE3::exp(&by.fixed_rows::<6>(0).into_owned());
         Sim3::new(pose * place.rigid, place.scale * by[6].exp())
     }
 
-    /// By how much one place is off another.
+    /// The error of one pose relative to another.
     fn difference(from: &Sim3, to: &Sim3) -> SVector<f64, PLACE_ERRORS> {
         let mut found = SVector::<f64, PLACE_ERRORS>::zeros();
         found.fixed_rows_mut::<6>(0).copy_from(&(to.rigid * from.rigid.inverse()).log());
@@ -269,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_errs_as_its_keyframe_and_its_pose_on_it_make_it() {
+    fn the_error_of_a_camera_combines_those_of_its_keyframe_and_its_pose_on_it() {
         let relative = Vector6::new(0.5, -0.4, 0.3, 0.6, -0.2, 0.1);
         for (of_place, of_pose) in [(1.0, 0.0), (0.0, 1.0), (-0.7, 0.9)] {
             let (by, relative) = (errors(0.3) * of_place, relative * of_pose);
@@ -281,7 +281,7 @@ mod tests {
             let exact = standing(&place(), Vector6::zeros());
             let expected =
                 difference(&exact, &standing(&off(&place(), &(by * STEP)), relative * STEP));
-            // Place and pose err independently: each way alone, or their sum.
+            // Errors of keyframe and camera are independent: each alone, or their sum.
             let covariance = relative * relative.transpose();
             let known = UncertainPlace { map_from_keyframe: place(), covariance: of_errors(&by) };
             let found = known.with_camera(&camera(), &covariance);
@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn a_follower_errs_as_its_leader_and_by_what_lies_between() {
+    fn a_follower_has_the_error_of_its_leader_and_the_one_between_them() {
         let covariance = Matrix6::from_diagonal_element(1e-4);
         let leader = |size: f64, moved: &Sim3| UncertainPlace {
             map_from_keyframe: *moved * place(),
@@ -325,11 +325,11 @@ mod tests {
         for (before, after) in [(1e-2, 1e-4), (1e-4, 1e-2)] {
             let (was, is) = (leader(before, &Sim3::identity()), leader(after, &moved));
             let found = next(&was).following(&was, &is).matrix();
-            // As if it had been made on the leader where that is now.
+            // As if it had been created on the leader at the leader's new pose.
             let expected = next(&is).covariance.matrix();
             assert!((found - expected).norm() < 1e-9 * expected.norm(), "{found}{expected}");
         }
-        // One that was more certain than its leader is as certain as that.
+        // One that was more certain than its leader becomes as certain as the leader.
         let (was, is) = (leader(1e-2, &Sim3::identity()), leader(1e-4, &Sim3::identity()));
         let sure = UncertainPlace { covariance: PlaceCovariance::ZERO, ..was };
         let found = sure.following(&was, &is).matrix();
@@ -337,9 +337,9 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_surer_than_ignorance_leaves_the_rest_as_it_is() {
+    fn a_variance_beyond_ignorance_is_clipped_and_the_rest_stays_unchanged() {
         let good = of_errors(&errors(0.5)).matrix() + PlaceMatrix::identity() * 1e-3;
-        // The unit alone is unknown, and far beyond all sense.
+        // Only the unit is unknown, and far beyond any plausible value.
         for beyond in [1.1, 1e9, 1e300] {
             let mut scales = SVector::<f64, PLACE_ERRORS>::repeat(1.0);
             scales[6] = (beyond / good[(6, 6)]).sqrt();
@@ -349,7 +349,7 @@ mod tests {
             assert!((found - expected).norm() < 1e-12 * expected.norm(), "{beyond}{found}");
             assert_eq!(found[(6, 6)], 1.0);
         }
-        // A direction in which it is exact, but for rounding.
+        // A direction in which it is exact, up to rounding.
         let mut rounded = good;
         rounded.fixed_view_mut::<1, PLACE_ERRORS>(2, 0).fill(1e-12);
         rounded.fixed_view_mut::<PLACE_ERRORS, 1>(0, 2).fill(1e-12);
@@ -363,11 +363,11 @@ mod tests {
     }
 
     #[test]
-    fn beside_a_variance_at_its_bound_a_follower_is_as_sure_as_its_leader() {
+    fn with_a_variance_at_its_bound_a_follower_is_as_certain_as_its_leader() {
         let with = |covariance| UncertainPlace { map_from_keyframe: place(), covariance };
         let sure = with(of_errors(&(errors(0.7) * 1e-3)));
         let unknown = with(PlaceCovariance::unknown());
-        // Its leader was unknown, and so it was made; its pose was clipped and that of the leader was not.
+        // Its leader was unknown, and so was it; its pose was clipped and that of the leader was not.
         let mut clipped = PlaceMatrix::identity() * 1e-2;
         clipped[(6, 6)] = 1.0;
         let follower = UncertainPlace {
@@ -389,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_covariance_is_refused() {
+    fn an_invalid_covariance_is_refused() {
         let good = of_errors(&errors(0.5));
         assert_eq!(PlaceCovariance::from_upper_triangle(good.upper_triangle()), Some(good));
         assert_eq!(PlaceCovariance::bounded(&good.matrix()), good);
@@ -402,7 +402,7 @@ mod tests {
             triangle[index] = value;
             triangle
         };
-        // The last is a correlation of what does not vary.
+        // The last is a correlation with an entry that has no variance.
         for bad in [with(0, f64::NAN), with(0, -1e-9), with(0, 2e6), with(27, 2.0), with(1, 1e-3)] {
             assert_eq!(PlaceCovariance::from_upper_triangle(bad), None, "{bad:?}");
         }

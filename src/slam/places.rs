@@ -1,9 +1,9 @@
-//! Place recognition: keyframes found by what they look like, not by where they are thought to be.
+//! Place recognition: finds keyframes by their appearance, independently of their estimated poses.
 //!
-//! [`Describer`] makes of an image a [`Description`]: corners at several scales (`scales`, `corners`) with an orientation
-//! and a binary descriptor (`pattern`, `description`). [`PlaceIndex`] keeps the descriptors of all keyframes in a tree
-//! that grows with them (`tree`), and ranks keyframes by how many features of an image they share in one arrangement
-//! (`arrangement`). There is no vocabulary; an index is not kept on disk but made again of descriptions, which are kept, or images.
+//! [`Describer`] turns an image into a [`Description`]: corners at several scales (`scales`, `corners`) with an
+//! orientation and a binary descriptor (`pattern`, `description`). [`PlaceIndex`] keeps the descriptors of all
+//! keyframes in a tree that grows with them (`tree`), and ranks keyframes by the features shared with an image in one
+//! arrangement (`arrangement`). There is no vocabulary; the index is rebuilt from stored descriptions, or images.
 
 mod arrangement;
 mod corners;

@@ -1,14 +1,14 @@
-//! What the tracker says of one frame: pose, covariance, state and quality.
+//! The tracking result of one frame: pose, covariance, status and quality.
 
 use nalgebra::{Matrix6, Vector3};
 
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 
-/// The id of no keyframe: before the mapper has made the first.
+/// The keyframe id before the mapper has created the first keyframe.
 pub const NO_KEYFRAME: u64 = u64::MAX;
 
-/// Variance of what is not known, units² of whatever it is measured in and radians²: large and finite.
+/// Variance of an unknown quantity, in its units² or radians²: large and finite.
 pub const UNKNOWN_VARIANCE: f64 = 1.0e6;
 
 /// Tracking status of a frame.
@@ -28,7 +28,7 @@ impl TrackingState {
     /// The names of the states, in the order of their codes.
     pub const NAMES: [&'static str; 4] = ["initializing", "tracking", "degraded", "lost"];
 
-    /// Its place among them.
+    /// Its index in [`Self::NAMES`].
     pub fn index(self) -> usize {
         match self {
             Self::Initializing => 0,
@@ -58,9 +58,9 @@ pub enum DegradedReason {
     LowOverlap,
     /// The residuals are larger than noise and depth variance explain.
     HighResidual,
-    /// Frames are missing between this one and the one before.
+    /// Frames are missing between this one and the previous one.
     Gap,
-    /// The known depth is out of view: the last view with a pose holds the rotation, and the translation as far as it is small.
+    /// The known depth is out of view: the last view with a pose holds the rotation, and the translation if small.
     Turning,
 }
 
@@ -88,7 +88,7 @@ pub struct Brightness {
     pub b: f64,
 }
 
-/// Figures that say how well a frame was aligned.
+/// Figures for the quality of an alignment.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Quality {
     /// Share of the keyframe's points that fall inside the frame, 0 to 1.
@@ -96,7 +96,7 @@ pub struct Quality {
     /// Share of the points compared (in view and not clipped by the sensor) whose residual is explained by noise and
     /// depth variance, 0 to 1.
     pub inlier_ratio: f64,
-    /// Root mean square of residual over its standard deviation, Huber-weighted; 1 when all is as modelled.
+    /// Root mean square of residual over its standard deviation, Huber-weighted; 1 if the model is right.
     pub whitened_rmse: f64,
     /// Root mean square residual of the points compared, grey levels.
     pub residual_rmse: f64,
@@ -107,22 +107,22 @@ pub struct Quality {
     pub finest_level: u32,
     /// Points compared.
     pub points: u32,
-    /// Mean squared optical flow from the keyframe to here, pixels² at level 0.
+    /// Mean squared optical flow from the keyframe to this frame, pixels² at level 0.
     pub mean_squared_flow: f64,
-    /// Standard deviation by which the whole image may be displaced unseen, pixels at level 0: from what displaces its
-    /// tiles against each other. The covariance holds it.
+    /// Standard deviation of an unobserved displacement of the whole image, pixels at level 0: from the displacement of
+    /// its tiles against each other. The covariance includes it.
     pub displacement_px: f64,
 }
 
-/// How a camera moves at the stamp of a frame: its mean motion since the frame before.
+/// The camera's velocity at the stamp of a frame: its mean since the previous frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Velocity {
-    /// Along the camera's own axes (x right, y down, z forward), world units a second.
+    /// Along the camera's own axes (x right, y down, z forward), world units per second.
     pub linear: Vector3<f64>,
-    /// About the camera's own axes, radians a second.
+    /// About the camera's own axes, radians per second.
     pub angular: Vector3<f64>,
     /// Upper triangle, row-major, of the covariance of (linear, angular), (world units/s)² and (rad/s)²: errors of both
-    /// poses, and what the velocity may have changed by within the interval. The error of the map's scale is not in it.
+    /// poses, and the possible change of the velocity within the interval, without the error of the map's scale.
     pub covariance: [f64; 21],
 }
 
@@ -133,53 +133,53 @@ pub struct PoseEstimate {
     pub sequence: u64,
     /// Stamp of the frame, nanoseconds.
     pub capture_nanos: i64,
-    /// Life of the map the pose belongs to.
+    /// Epoch of the map that the pose belongs to.
     pub epoch: u32,
-    /// Revision of the keyframe it was tracked on.
+    /// Revision of the keyframe that it was tracked on.
     pub revision: u64,
-    /// Keyframe it was tracked on, [`NO_KEYFRAME`] before the first.
+    /// Keyframe that it was tracked on, [`NO_KEYFRAME`] before the first.
     pub keyframe_id: u64,
     /// Tracking status.
     pub state: TrackingState,
-    /// How often the map had been corrected when that keyframe was published.
+    /// Number of corrections of the map when that keyframe was published.
     pub map_revision: u64,
-    /// Odometry pose; never jumps within an epoch, but where a view was held ([`DegradedReason::Turning`]) and ends.
+    /// Odometry pose; never jumps within an epoch, except where a hold ([`DegradedReason::Turning`]) ends.
     pub world_from_camera: SE3,
     /// Pose in the map, the best estimate; jumps where the map is corrected.
     pub map_from_camera: SE3,
     /// Pose relative to the keyframe, translation in keyframe units.
     pub keyframe_from_camera: SE3,
-    /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation)
-    /// of `current_from_keyframe`, keyframe units and radians: noise of single points, errors that the
-    /// whole depth of the keyframe shares, and displacements of the whole image
-    /// ([`covariance_floor`](crate::slam::tracker::covariance_floor)). This is what is published. It says nothing about
-    /// the place of the keyframe itself.
+    /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation) of
+    /// `current_from_keyframe`, keyframe units and radians: noise of single points, errors common to the keyframe's
+    /// whole depth, and displacements of the whole image
+    /// ([`covariance_floor`](crate::slam::tracker::covariance_floor)). This is the published one. It does not include
+    /// the uncertainty of the keyframe's own pose.
     pub covariance: [f64; 21],
-    /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation) of `map_from_camera`, map
-    /// units and radians ([`place_covariance`](crate::slam::place_covariance)): what the keyframe's place is
-    /// uncertain by, and `covariance`. Relative to the keyframes that held those that were estimated with it.
+    /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation) of `map_from_camera`,
+    /// map units and radians ([`place_covariance`](crate::slam::place_covariance)): the uncertainty of the keyframe's
+    /// pose plus `covariance`. Relative to the keyframes that were held when it was estimated.
     pub map_covariance: [f64; 21],
-    /// The same as `covariance` of the alignment alone, as if the errors of distant points were independent: too sure to
-    /// be fused. The mapper weighs matches with it.
+    /// Like `covariance`, but of the alignment alone, as if the errors of distant points were independent: too small
+    /// for fusion. The mapper weights matches with it.
     pub alignment_covariance: [f64; 21],
-    /// How the camera moves; `None` where this frame or the one before has no pose, or they are of different epochs, and
-    /// at a view that is held ([`DegradedReason::Turning`]).
+    /// The camera's velocity; `None` where this frame or the previous one has no pose, or they belong to different
+    /// epochs, and while a view is held ([`DegradedReason::Turning`]).
     pub velocity: Option<Velocity>,
     /// Brightness against the keyframe.
     pub brightness: Brightness,
     /// Figures of the alignment.
     pub quality: Quality,
-    /// Whether the tracker asks for a new keyframe at this frame.
+    /// Whether the tracker requests a new keyframe at this frame.
     pub proposes_keyframe: bool,
 }
 
 impl PoseEstimate {
-    /// Nothing known of `frame` yet: at the world's origin, not claimed.
+    /// The estimate before anything is known about `frame`: at the world's origin, not claimed.
     pub fn unknown(frame: &FrameView<'_>) -> Self {
         Self::unknown_at(frame.sequence, frame.capture_nanos)
     }
 
-    /// The same of a frame with this number and stamp.
+    /// The same for a frame with this sequence and stamp.
     pub fn unknown_at(sequence: u64, capture_nanos: i64) -> Self {
         Self {
             sequence,
@@ -227,7 +227,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_upper_triangle_is_a_whole_matrix() {
+    fn the_upper_triangle_is_a_full_matrix() {
         let triangle = std::array::from_fn(|i| i as f64);
         let full = full_covariance(&triangle);
         assert_eq!((full[(0, 5)], full[(5, 0)], full[(1, 1)], full[(5, 5)]), (5.0, 5.0, 6.0, 20.0));

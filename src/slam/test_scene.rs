@@ -35,7 +35,7 @@ impl Rendering {
 pub struct Random(u64);
 
 impl Random {
-    /// The numbers of a seed.
+    /// The sequence of a seed.
     pub fn new(seed: u64) -> Self {
         Self(seed.wrapping_mul(0xD134_2543_DE82_EF95).wrapping_add(1))
     }
@@ -64,7 +64,7 @@ struct Cuboid {
 }
 
 impl Cuboid {
-    /// Where a ray of this `inverse` direction enters and leaves, as multiples of its direction, with the axes of the faces.
+    /// Entry and exit of a ray with this `inverse` direction, in multiples of it, with the axes of the faces.
     fn cross(&self, origin: &Vector3<f64>, inverse: &Vector3<f64>) -> Option<[(f64, usize); 2]> {
         let (mut enter, mut leave) = ((f64::NEG_INFINITY, 0), (f64::INFINITY, 0));
         for axis in 0..3 {
@@ -80,7 +80,7 @@ impl Cuboid {
         (enter.0 < leave.0).then_some([enter, leave])
     }
 
-    /// Columns and rows in which a camera can see it: all where it reaches behind the camera.
+    /// Columns and rows in which a camera can see the box: all where it extends behind the camera.
     fn seen_in(&self, camera: &Intrinsics, camera_from_world: &SE3) -> [Range<f64>; 2] {
         const ALL: Range<f64> = f64::NEG_INFINITY..f64::INFINITY;
         let mut seen = [f64::INFINITY..f64::NEG_INFINITY, f64::INFINITY..f64::NEG_INFINITY];
@@ -113,7 +113,7 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// The room of a seed: same plan, other places and other texture.
+    /// The room of a seed: same layout, other positions and other texture.
     pub fn new(seed: u64) -> Self {
         let mut random = Random::new(seed);
         let mut cuboid = |low: [f64; 3], size: [f64; 3]| {
@@ -131,7 +131,7 @@ impl Scene {
         Self { seed, room, boxes, period: None, contrast: 1.0 }
     }
 
-    /// The same room, its walls with the same texture, with the boxes of the room of another seed moved by as many metres
+    /// The same room, its walls with the same texture, but with the boxes of another seed's room, moved by `by` metres
     /// along x.
     pub fn refurnished(self, seed: u64, by: f64) -> Self {
         let boxes = Self::new(seed).boxes.map(|Cuboid { low, high }| {
@@ -141,18 +141,18 @@ impl Scene {
         Self { boxes, ..self }
     }
 
-    /// The same texture on walls this many times as far away.
+    /// The same texture on walls that are `factor` times as far away.
     pub fn resized(self, factor: f64) -> Self {
         let room = Cuboid { low: self.room.low * factor, high: self.room.high * factor };
         Self { room, ..self }
     }
 
-    /// The same with a texture of this share of the contrast.
+    /// The same room with the texture at this share of its contrast.
     pub fn with_contrast(self, contrast: f64) -> Self {
         Self { contrast, ..self }
     }
 
-    /// A corridor along z without boxes whose texture repeats.
+    /// A corridor along z without boxes, with a repeating texture.
     pub fn corridor(seed: u64, period: f64) -> Self {
         let far = Vector3::new(0.0, 0.0, 1000.0);
         let room =
@@ -163,7 +163,7 @@ impl Scene {
         Self { room, boxes, period: Some(period), ..scene }
     }
 
-    /// A keyframe of [`CAMERA`] with exact depth at every fourth pixel, and noise of this standard deviation.
+    /// A keyframe of [`CAMERA`] with exact depth at every fourth pixel, and image noise of this standard deviation.
     pub fn keyframe(&self, keyframe_id: u64, world_from_camera: SE3, noise: f64) -> Keyframe {
         let view = self.render(&CAMERA, &world_from_camera);
         let pixels = (4..CAMERA.height - 4)
@@ -227,8 +227,8 @@ impl Scene {
         self.texture(surface * 3 + axis as u64, repeated(x), repeated(y), cells)
     }
 
-    /// Distance along the ray (depth, for rays of unit depth), axis of the face and surface; of the boxes only those that
-    /// are `near` the ray are looked at.
+    /// Distance along the ray (depth, for rays of unit depth), axis of the face, and surface; only the boxes that are
+    /// `near` the ray are tested.
     fn hit(
         &self,
         origin: &Vector3<f64>,
@@ -249,20 +249,20 @@ impl Scene {
         nearest
     }
 
-    /// Smooth noise of three sizes and soft-edged stripes, so that there are corners and edges.
+    /// Smooth noise at three scales and soft-edged stripes, so that there are corners and edges.
     fn texture(&self, surface: u64, x: f64, y: f64, [fine, middle, coarse]: &mut [Cell; 3]) -> f64 {
         let surface = surface ^ (self.seed << 8);
         let noise = 45.0 * fine.noise(surface, x / 0.06, y / 0.06)
             + 50.0 * middle.noise(surface ^ 0x55, x / 0.2, y / 0.2)
             + 60.0 * coarse.noise(surface ^ 0xAA, x / 0.7, y / 0.7);
-        // tanh z, of the one function that is fast.
+        // tanh z, from the one function that is fast.
         let tanh = |z: f64| 1.0 - 2.0 / ((2.0 * z).exp() + 1.0);
         let stripes = 25.0 * tanh((4.0 * x + 1.5 * y).sin() * 12.0);
         128.0 + self.contrast * (noise + stripes)
     }
 }
 
-/// A cell of a unit lattice, and the noise at its corners: those of the ray before are mostly those of the next.
+/// A cell of a unit lattice, and the noise at its corners: successive rays mostly share them.
 #[derive(Clone, Copy, Default)]
 struct Cell {
     /// Seed of the lattice, column and row; `None` before the first.

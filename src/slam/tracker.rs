@@ -28,37 +28,36 @@ use crate::slam::tracker::turning::{Turning, may_turn};
 use crate::slam::tracker::velocity::VelocityMemory;
 use crate::slam::tracker::verdict::{VerdictParams, fits_better, is_better, quality_of};
 
-/// Standard deviations by which a pose may differ from one that is held: of a hundred finds one is refused for nothing.
+/// Standard deviations by which a pose may differ from the held one: one of a hundred correct finds is refused.
 pub const MOST_DEVIATIONS: f64 = 3.0;
 
 /// Tuning of the tracker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrackerParams {
-    /// Which points of a keyframe are aligned.
+    /// Selection of a keyframe's points.
     pub reference: ReferenceParams,
-    /// How they are aligned.
+    /// Alignment of those points.
     pub alignment: AlignmentParams,
     /// Tracking status.
     pub verdict: VerdictParams,
-    /// What the published covariance holds beside noise and common errors of depth.
+    /// The part of the published covariance beyond noise and common errors of depth.
     pub covariance_floor: CovarianceFloorParams,
-    /// The coarsest level fits badly, and other motions are tried, when its whitened RMSE is
-    /// above this many times the last good one. DSO gives a level up at 1.5.
+    /// The coarsest level fits badly, and other motions are tried, when its whitened RMSE exceeds the last good one by
+    /// this factor. DSO gives a level up at 1.5.
     pub poor_fit_ratio: f64,
-    /// Rotation about each axis of the other motions, degrees: half of what the coarsest level
-    /// converges from.
+    /// Rotation about each axis of the other motions, degrees: half the convergence range of the coarsest level.
     pub hypothesis_rotation_deg: f64,
-    /// Rotation about each axis of the views near the keyframe's own that a lost tracker tries,
-    /// degrees: as far as a coarse alignment reaches, so that the views join.
+    /// Rotation about each axis of the views near the keyframe's own that a lost tracker tries, degrees: as far as a
+    /// coarse alignment converges, so that the ranges of the views join.
     pub recovery_rotation_deg: f64,
-    /// Standard deviation of the translation, in mean depths, up to which a pose is claimed where the known depth is out of
-    /// view and the last view with a pose holds the camera; 0 claims none. Beyond it only the rotation is known.
+    /// Standard deviation of the translation, in mean depths, up to which a pose is claimed while the known depth is
+    /// out of view and the last view with a pose holds the camera; 0 claims none. Beyond it only the rotation is known.
     pub max_turning_deviation: f64,
     /// Standard deviation of the coarsest level, grey levels, below which a frame has no
     /// contrast: covered lens, overexposure, a white wall.
     pub min_contrast: f64,
-    /// w_d of the keyframe distance: a keyframe is asked for at 1/w_d of the mean depth.
+    /// w_d of the keyframe distance: a keyframe is requested at 1/w_d of the mean depth.
     pub keyframe_distance_weight: f64,
     /// w_u of the keyframe distance: … or when 1/w_u of the points are out of view.
     pub keyframe_usage_weight: f64,
@@ -87,7 +86,7 @@ impl Default for TrackerParams {
 }
 
 impl TrackerParams {
-    /// The weights of the distance at which a keyframe is asked for.
+    /// The weights of the distance at which a keyframe is requested.
     pub fn keyframe_distance(&self) -> DistanceWeights {
         DistanceWeights {
             translation: self.keyframe_distance_weight,
@@ -124,18 +123,18 @@ pub struct Tracker {
     turning: Turning,
 }
 
-/// What a tracker remembers from frame to frame.
+/// State of a tracker that carries over from frame to frame.
 #[derive(Debug, Clone, Default)]
 pub struct Memory {
     motion: Motion,
     velocity: VelocityMemory,
     brightness: Brightness,
     last_sequence: Option<u64>,
-    /// Whether the frame before was not tracked on a keyframe.
+    /// Whether the previous frame was not tracked on a keyframe.
     was_lost: bool,
-    /// That of the last pose that was claimed, and keyframe_id.
+    /// Covariance of the last estimate.
     covariance: [f64; 21],
-    /// Unit of that covariance's translations, in the world's.
+    /// Unit of its translations, in world units.
     unit: f64,
     coarse_fit: Option<f64>,
 }
@@ -164,26 +163,26 @@ impl Tracker {
         })
     }
 
-    /// Memory for references that are prepared on its thread.
+    /// Scratch memory for references that are prepared on the tracker's thread.
     pub fn scratch(&mut self) -> &mut ReferenceScratch {
         &mut self.turning.unknown.scratch
     }
 
-    /// Makes a prepared reference the active one and gives back the one before, for its memory. The
-    /// first of another epoch forgets where the camera was.
+    /// Makes a prepared reference the active one and returns the previous one, for its memory. The first one of a later
+    /// epoch resets the camera's motion.
     pub fn adopt(&mut self, reference: Box<Reference>) -> Option<Box<Reference>> {
-        /// Frames that a mapper may be behind with the first keyframe of an epoch: ten seconds at 30 Hz.
+        /// Frames by which a mapper may lag with the first keyframe of an epoch: ten seconds at 30 Hz.
         const MOST_FRAMES_BEHIND: u64 = 300;
         let before = self.reference.replace(reference);
         let (old, new) = (before.as_deref(), self.reference.as_deref());
         if let (Some(old), Some(new)) = (old, new) {
-            // A keyframe whose epoch was joined to another has another number for the same place, and an earlier
-            // epoch that is taken up again lies where odometry has the camera.
+            // A keyframe whose epoch was joined to another has a new epoch number but the same pose, and an earlier
+            // epoch that is resumed is placed where the odometry has the camera.
             if old.epoch() < new.epoch() && old.keyframe_id() != new.keyframe_id() {
                 self.memory.motion = Motion::default();
                 self.memory.velocity.forget();
-                // On a keyframe that the mapper did not make just now, of a map that it has gone over to, the camera may
-                // be anywhere.
+                // On a keyframe that was not created just now, but belongs to a map that the mapper switched to, the
+                // camera may be anywhere.
                 let age =
                     self.memory.last_sequence.and_then(|last| last.checked_sub(new.sequence()));
                 self.memory.was_lost = age.is_none_or(|age| age > MOST_FRAMES_BEHIND);
@@ -202,21 +201,21 @@ impl Tracker {
         before
     }
 
-    /// Continues where another tracker of this camera ended: at `nanos` it claimed this pose. The next frame
-    /// is searched for around it, and must fit as well as after a loss.
+    /// Continues from another tracker of this camera, which claimed this pose at `nanos`. The next frame is searched
+    /// around it, and must fit as well as after a loss.
     pub fn resume_at(&mut self, nanos: i64, world_from_camera: &SE3) {
         self.memory.motion.observe(nanos, world_from_camera);
         self.memory.velocity.forget();
         self.memory.was_lost = true;
     }
 
-    /// Begins on a map that is not its own, without a word of where the camera is: what it finds must fit as well
-    /// as after a loss, or it would claim any pose near the keyframe's own that half of the points agree with.
+    /// Starts on another tracker's map, without a pose of the camera: a pose must fit as well as after a loss, or any
+    /// pose near the keyframe's own with which half of the points agree would be claimed.
     pub fn begin_lost(&mut self) {
         self.memory.was_lost = true;
     }
 
-    /// Whether a tracker's first keyframe is one that the camera was found on: the first of a map are its first two.
+    /// Whether the camera was relocalised on a tracker's first keyframe: that of a new map has id 0 or 1.
     pub fn is_found_on(keyframe_id: u64) -> bool {
         keyframe_id > 1
     }
@@ -233,8 +232,8 @@ impl Tracker {
         self.turning.end();
     }
 
-    /// Tracks one frame. `budget` is asked before each iteration with the pyramid level it would
-    /// run on and says whether there is time for it (always yes in lockstep and replay).
+    /// Tracks one frame. `budget` is called before each iteration with the pyramid level it would run on and returns
+    /// whether there is time for it (always true in lockstep and replay).
     pub fn track(
         &mut self,
         frame: &FrameView<'_>,
@@ -283,20 +282,20 @@ impl Tracker {
         estimate
     }
 
-    /// What the next frame may need and the pose of this one need not wait for, some milliseconds where known depth is out
-    /// of view or nearly: to be called when the pose has been published. [`Self::track`] does it first where it was not.
+    /// Prepares what the next frame may need and this pose need not wait for, some milliseconds where known depth is
+    /// out of view or nearly: to be called once the pose is published. [`Self::track`] does it first otherwise.
     pub fn prepare_next(&mut self) {
         let Self { turning, intrinsics, pyramid, .. } = self;
         turning.prepare(intrinsics, pyramid);
     }
 
-    /// What it remembers of the frames so far, for [`Self::rehearse`].
+    /// The state carried over from the frames so far, for [`Self::rehearse`].
     pub fn memory(&self) -> &Memory {
         &self.memory
     }
 
-    /// What [`Self::track`] would say of `frame` with `memory` and another budget. This tracker's own
-    /// memory stays as it is.
+    /// Result of [`Self::track`] for `frame` with `memory` and another budget. This tracker's own memory stays
+    /// unchanged.
     pub fn rehearse(
         &mut self,
         memory: &Memory,
@@ -312,7 +311,7 @@ impl Tracker {
         estimate
     }
 
-    /// Frames between this one and the one before.
+    /// Number of frames missing between this one and the previous one.
     fn count_missing(&mut self, sequence: u64) -> u64 {
         let before = self.memory.last_sequence.replace(sequence);
         before.map_or(0, |before| sequence.saturating_sub(before).saturating_sub(1))
@@ -334,8 +333,8 @@ impl Tracker {
         flat.then_some(LostReason::UnusableFrame)
     }
 
-    /// Aligns from the predicted pose, and from others where that fits badly. Also gives the whitened
-    /// RMSE of the coarsest level, where there was time and a view to solve it.
+    /// Aligns from the predicted pose, and from others where that fits badly. Also returns the whitened RMSE of the
+    /// coarsest level, where there was time and a view to solve it.
     fn align(
         &mut self,
         reference: &Reference,
@@ -343,7 +342,7 @@ impl Tracker {
         budget: &mut dyn FnMut(usize) -> bool,
     ) -> (Alignment, Option<f64>) {
         let nanos = frame.capture_nanos;
-        // Before the first pose the camera stands where the keyframe was taken.
+        // Before the first pose the camera is assumed to be where the keyframe was taken.
         let first = reference.world_from_keyframe().place(&SE3::identity());
         let predicted = self.memory.motion.predict(nanos, 1.0).unwrap_or(first);
         let mut best = self.align_coarsest(reference, &predicted, budget);
@@ -380,9 +379,9 @@ impl Tracker {
         (best, coarse_fit)
     }
 
-    /// Of an alignment on the coarsest level and the prediction that it began with, the one that explains the next level
-    /// better when both are solved there: the few pixels of the coarsest may fit best elsewhere, and from a wrong
-    /// minimum the finer levels do not return.
+    /// Of an alignment on the coarsest level and the prediction it started from, the one that explains the next level
+    /// better when both are solved there: the few pixels of the coarsest may fit best elsewhere, and the finer levels
+    /// do not return from a wrong minimum.
     fn better_on_next(
         &self,
         reference: &Reference,
@@ -398,7 +397,7 @@ impl Tracker {
         if !aligner.solve_level(reference, frame, level, &mut coarsest, budget) {
             return coarsest;
         }
-        // A level takes pose and brightness alone from what it begins with.
+        // A level takes only pose and brightness from its start.
         direct.state.current_from_keyframe =
             reference.world_from_keyframe().locate(predicted).inverse();
         direct.state.brightness = self.memory.brightness;
@@ -412,9 +411,8 @@ impl Tracker {
         }
     }
 
-    /// Of an alignment that was cut short and the prediction it began with, the one that
-    /// explains the finest level better, and one step from there: a coarse level alone is often worse than
-    /// constant motion.
+    /// Of an alignment that was cut short and the prediction it started from, the one that explains the finest level
+    /// better, and one step from there: a coarse level alone is often worse than constant motion.
     fn better_when_cut_short(
         &self,
         reference: &Reference,
@@ -434,13 +432,13 @@ impl Tracker {
             if fits_better(&explain(&one), &explain(&other)) { one } else { other }
         };
         let best = better(guessed, reached);
-        // The sums are there: the step costs one look.
+        // The sums are available: the step costs one evaluation.
         let Some((pose, brightness)) = best.state.after_step() else { return best };
         let (aligner, frame) = (&self.aligner, &self.pyramid);
         better(aligner.stand_on_finest(reference, frame, cut_short, &pose, brightness), best)
     }
 
-    /// Solves the coarsest level with points from one pose in the world.
+    /// Solves the coarsest level that has points, from one pose in the world.
     fn align_coarsest(
         &self,
         reference: &Reference,
@@ -455,7 +453,7 @@ impl Tracker {
         alignment
     }
 
-    /// Whether the coarsest level says that the prediction led astray.
+    /// Whether the coarsest level shows that the prediction was wrong.
     fn fits_poorly(&self, alignment: &Alignment) -> bool {
         let quality = quality_of(alignment);
         let bound =

@@ -13,7 +13,7 @@ pub struct StampedPose {
     pub world_from_camera: SE3,
 }
 
-/// A pose, and the epoch whose origin and unit of length it has.
+/// A pose, with the epoch that defines its origin and unit of length.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct EpochPose {
     /// The epoch.
@@ -22,14 +22,14 @@ pub struct EpochPose {
     pub pose: StampedPose,
 }
 
-/// The poses of each epoch, in their order; an epoch may have been left and taken up again.
+/// The poses of each epoch, in order; an epoch may have been left and resumed.
 pub fn by_epoch(poses: &[EpochPose]) -> BTreeMap<u32, Vec<StampedPose>> {
     let mut epochs: BTreeMap<u32, Vec<StampedPose>> = BTreeMap::new();
     poses.iter().for_each(|of| epochs.entry(of.epoch).or_default().push(of.pose));
     epochs
 }
 
-/// Among the poses of `epoch`, in their order, the places of those before which other epochs stand, after one of its own.
+/// Among the poses of `epoch`, in order, the indices of those that other epochs separate from the one before.
 pub fn gaps_in(poses: &[EpochPose], epoch: u32) -> Vec<usize> {
     let at: Vec<usize> = (0..poses.len()).filter(|&i| poses[i].epoch == epoch).collect();
     (1..at.len()).filter(|&i| at[i] > at[i - 1] + 1).collect()
@@ -40,7 +40,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_epoch_has_a_gap_where_another_stands_in_it() {
+    fn an_epoch_has_a_gap_where_another_interrupts_it() {
         let pose = StampedPose { nanos: 0, world_from_camera: SE3::identity() };
         let poses = [0, 1, 1, 0, 0, 2, 1].map(|epoch| EpochPose { epoch, pose });
         assert_eq!(

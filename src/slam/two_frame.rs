@@ -1,8 +1,7 @@
-//! The first depth of a map from two frames: pose, brightness and the depths of the first frame's
-//! points together, frame after frame, until parallax is proven (after the idea of Engel, Koltun,
-//! Cremers 2018 §3.1).
+//! The first depth of a map from two frames: pose, brightness and the depths of the first frame's points are estimated
+//! jointly, frame after frame, until parallax is proven (after the idea of Engel, Koltun, Cremers 2018 §3.1).
 //!
-//! A camera that stands or only turns never gets there, however noisy its images: see [`evidence`].
+//! A camera that stands still or only rotates never starts, however noisy its images: see [`evidence`].
 
 mod covariance;
 pub(crate) mod earlier_frames;
@@ -52,23 +51,23 @@ use crate::slam::two_frame::waypoint::Waypoint;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TwoFrameParams {
-    /// The points of the first frame.
+    /// Selection of the points of the first frame.
     pub candidates: CandidateParams,
-    /// The fit.
+    /// Tuning of the fit.
     pub fit: FitParams,
-    /// What counts as proof.
+    /// Thresholds of the proof.
     pub evidence: EvidenceParams,
-    /// Fewer points than this cannot carry a start.
+    /// Least number of points for a start.
     pub min_points: usize,
-    /// Frames in a row that must prove the parallax and agree on the direction: one alone may be a blink.
+    /// Consecutive frames that must prove the parallax and agree on the direction: a single one may be chance.
     pub confirming_frames: u32,
-    /// Frames after which an unproven start begins again on a new first frame: 2 s at 30 Hz.
+    /// Frames after which an unproven start is restarted on a new first frame: 2 s at 30 Hz.
     pub max_frames: u32,
-    /// Frames in a row that may fail to match before it begins again.
+    /// Consecutive frames that may fail to match before it is restarted.
     pub max_mismatches: u32,
-    /// Earlier frames that are kept to choose between motions: about 1 MB each at 640×480.
+    /// Earlier frames kept for choosing between motions: about 1 MB each at 640×480.
     pub max_earlier_frames: usize,
-    /// Standard deviation that interpolation and sampling leave in a match, pixels.
+    /// Standard deviation of a match due to interpolation and sampling, pixels.
     pub match_noise_px: f32,
 }
 
@@ -103,7 +102,7 @@ impl TwoFrameParams {
     }
 }
 
-/// Finds the first depth. Keeps its memory; the same frames give the same result.
+/// Finds the first depth. Reuses its memory; the same frames give the same result.
 #[derive(Debug)]
 pub struct TwoFrameInitializer {
     params: TwoFrameParams,
@@ -127,11 +126,11 @@ pub struct TwoFrameInitializer {
     significance: f64,
     /// Least median residual of a frame since the first, grey levels.
     least_residual: f64,
-    /// Direction from the first camera to the one before, in the first frame; where the start went on from another frame,
-    /// at first the one in which the camera came there.
+    /// Direction from the first camera to the previous one, in the first frame; after a restart on another frame,
+    /// initially the direction in which the camera arrived there.
     heading: Vector3<f64>,
     lead: Lead,
-    /// The frame before, where the next one may need it.
+    /// The previous frame, where the next one may need it.
     waypoint: Option<Waypoint>,
     frames: u32,
     confirmed: u32,
@@ -139,7 +138,7 @@ pub struct TwoFrameInitializer {
 }
 
 impl TwoFrameInitializer {
-    /// An initialiser for images of `intrinsics`; nothing is begun.
+    /// An initialiser for images of `intrinsics`, without a first frame.
     pub fn new(intrinsics: Intrinsics, params: TwoFrameParams) -> Result<Self, ParameterError> {
         params.validate()?;
         check_range("image width", intrinsics.width, 32..=8192)?;
@@ -175,7 +174,7 @@ impl TwoFrameInitializer {
         })
     }
 
-    /// Begins on a first frame; `false` where it has the wrong size or too little texture.
+    /// Starts on a first frame; `false` where it has the wrong size or too little texture.
     pub fn begin(&mut self, pixels: &[u8]) -> bool {
         self.first_pixels.clear();
         if pixels.len() != self.intrinsics[0].width * self.intrinsics[0].height {
@@ -203,7 +202,7 @@ impl TwoFrameInitializer {
         true
     }
 
-    /// Takes the next frame: fits, judges, and begins again by itself where it must.
+    /// Takes the next frame: fits, judges, and restarts where it must.
     pub fn step(&mut self, pixels: &[u8]) -> InitOutcome {
         if pixels.len() != self.intrinsics[0].width * self.intrinsics[0].height {
             return self.outcome(InitState::Failed(Failure::WrongSize), Evidence::default());
@@ -230,7 +229,7 @@ impl TwoFrameInitializer {
         outcome
     }
 
-    /// Fits a frame against the first one and judges.
+    /// Fits a frame against the first one and judges the result.
     fn follow(&mut self, pixels: &[u8]) -> InitOutcome {
         self.pyramid.fill(pixels);
         self.frames += 1;
@@ -248,7 +247,7 @@ impl TwoFrameInitializer {
             self.refit();
             evidence = self.judge();
             if evidence.missing(&self.params.evidence).is_some() {
-                // Without the priors it went astray: the next frame is not fitted from there.
+                // Without the priors it diverged: the next frame is not fitted from there.
                 *self.joint.best().0 = before;
             }
         }
@@ -284,7 +283,7 @@ impl TwoFrameInitializer {
         self.outcome(state, evidence)
     }
 
-    /// Begins on the frame before; what it proved still counts. `false` where it has too little texture.
+    /// Restarts on the previous frame; what it proved still counts. `false` where it has too little texture.
     fn begin_on(&mut self, waypoint: &Waypoint) -> bool {
         let has_begun = self.begin(&waypoint.pixels);
         (self.heading, self.confirmed) = (waypoint.heading, waypoint.confirmed);
@@ -292,14 +291,14 @@ impl TwoFrameInitializer {
         has_begun
     }
 
-    /// The frame that the depths belong to; empty before one is begun.
+    /// The frame that the depths belong to; empty before the start.
     pub fn first_pixels(&self) -> &[u8] {
         &self.first_pixels
     }
 
-    /// The depths of the first frame's points as the latest frame left them; usable once proven.
+    /// The depths of the first frame's points after the latest frame; usable once proven.
     pub fn depths(&self) -> impl Iterator<Item = InitialDepth> {
-        /// A depth is usable when it is known to within half of itself.
+        /// Largest relative standard deviation of a usable depth.
         const USABLE_STD_DEV_RATIO: f32 = 0.5;
         let depths = self.inverse_depths.iter().zip(&self.variances);
         self.points.pixels.iter().zip(depths).filter_map(
@@ -311,14 +310,14 @@ impl TwoFrameInitializer {
         )
     }
 
-    /// Fills a depth map that was restarted on [`TwoFrameInitializer::first_pixels`]: the points, and
-    /// around them every candidate pixel with a wider variance.
+    /// Fills a depth map that was restarted on [`TwoFrameInitializer::first_pixels`]: the points, and around them every
+    /// candidate pixel with a larger variance.
     pub fn fill(&self, map: &mut DepthMap) {
         let depths: Vec<InitialDepth> = self.depths().collect();
         spread(&depths, map);
     }
 
-    /// Rotation and brightness alone, coarse to fine, from the frame before.
+    /// Fits only rotation and brightness, coarse to fine, from the previous frame's.
     fn fit_rotation(&mut self) {
         let input = input(self.pyramid.levels(), &self.intrinsics, &self.points);
         for level in (0..self.intrinsics.len()).rev() {
@@ -327,12 +326,12 @@ impl TwoFrameInitializer {
         }
     }
 
-    /// Pose, brightness and depths together, coarse to fine, from several starts.
+    /// Fits pose, brightness and depths jointly, coarse to fine, from several starts.
     fn fit_jointly(&mut self) {
-        /// Significance of the frame before from which on parallax may show.
+        /// Significance of the previous frame from which parallax may show.
         const PARALLAX_SIGNIFICANCE: f64 = 3.0;
         let input = input(self.pyramid.levels(), &self.intrinsics, &self.points);
-        // Before the first fit nothing is known: where the camera moves on by many pixels the right motion may not be
+        // Before the first fit nothing is known: where the camera moves by many pixels the right motion may not be
         // found from rest.
         let with_directions = self.frames == 1 || self.significance > PARALLAX_SIGNIFICANCE;
         self.joint.fit(
@@ -344,12 +343,12 @@ impl TwoFrameInitializer {
         );
     }
 
-    /// Whether the gain differs from place to place, as behind a lens with a vignette where the image moves across it. Where
-    /// it does not, free slopes would only soften the modes of depth: the relief of a start on a rendered office from
-    /// 0.03 off to 0.13.
+    /// Whether the gain varies over the image, as behind a lens with vignetting when the image moves across it. Where
+    /// it does not, free slopes would only weaken the constraint on the modes of depth: the relief error of a start on
+    /// a rendered office rose from 0.03 to 0.13.
     fn needs_slopes(&mut self) -> bool {
-        /// Share of the energy that slopes must explain: 0.03 at most in recordings of even light, in single blurred frames
-        /// 0.06; where the corners lose half of their light up to 0.27, once the image has moved.
+        /// Share of the energy that slopes must explain: at most 0.03 in recordings with even light, 0.06 in single
+        /// blurred frames; up to 0.27 where the corners lose half of their light, once the image has moved.
         const LEAST_SHARE: f64 = 0.06;
         if self.rotation.gain_slopes.is_some() {
             return false;
@@ -358,16 +357,16 @@ impl TwoFrameInitializer {
         self.joint.promised_by_slopes(&input, &self.params.fit) > LEAST_SHARE
     }
 
-    /// Lets the gain differ from place to place up to the end of this start, in the frames before as well.
+    /// Lets the gain vary over the image until the end of this start, in the previous frames as well.
     fn free_slopes(&mut self) {
         self.rotation.free_slopes();
         self.joint.free_slopes();
         self.earlier_frames.free_slopes();
     }
 
-    /// The best motion and its depths again, by the images alone. The priors lead to a motion; in the
-    /// modes that two frames hardly show (tilt, relief) those of all points add up and would flatten the
-    /// scene: by 20 to 60 % on a rendered office.
+    /// Fits the best motion and its depths again, by the images alone. The priors lead to a motion; in the modes that
+    /// two frames hardly constrain (tilt, relief) the priors of all points add up and would flatten the scene: by 20 to
+    /// 60 % on a rendered office.
     fn refit(&mut self) {
         /// Finest levels that are fitted again: the motion is known.
         const LEVELS: usize = 2;
@@ -378,7 +377,7 @@ impl TwoFrameInitializer {
         }
     }
 
-    /// Variances and figures of the latest fit; then the scale goes to mean inverse depth 1.
+    /// Computes variances and figures of the latest fit, then scales to mean inverse depth 1.
     fn judge(&mut self) -> Evidence {
         let (rival, scored_by) = (self.joint.rival, self.joint.scored_by);
         let (state, scratch) = self.joint.best();
@@ -396,14 +395,14 @@ impl TwoFrameInitializer {
             rival,
             earlier_frames: scored_by,
             common_error,
-            // Images without noise leave next to nothing while the camera hardly moves.
+            // Noise-free images leave next to no residual while the camera hardly moves.
             least_residual: self.least_residual.max(self.params.fit.noise.pixel_std_dev.into()),
             ..evidence
         };
         let visible = joint.points().zip(&state.inverse_depths).filter(|(p, _)| p.visible);
         let mean =
             visible.map(|(_, d)| f64::from(*d)).sum::<f64>() / joint.num_visible.max(1) as f64;
-        /// A mean below this is not a scale but a failed fit.
+        /// A smaller mean is not a scale but a failed fit.
         const MIN_MEAN: f64 = 0.05;
         self.pose_covariance = covariance.map_or_else(Matrix6::zeros, |covariance| {
             covariance.fixed_view::<6, 6>(0, 0) * f64::from(noise)
@@ -423,7 +422,7 @@ impl TwoFrameInitializer {
         evidence
     }
 
-    /// Counts the frames in a row that prove the parallax and agree on where the camera went.
+    /// Counts the consecutive frames that prove the parallax and agree on the direction of motion.
     fn count_confirmation(&mut self, proves: bool, heading: &Vector3<f64>) {
         /// Cosine of 20°: a hand does not turn its path by more within a frame, a wrong minimum does.
         const MIN_AGREEMENT: f64 = 0.94;
@@ -450,7 +449,7 @@ impl TwoFrameInitializer {
     }
 }
 
-/// The whole of a frame.
+/// The fit input of a full frame.
 fn input<'a>(
     images: &'a [Image<f32>],
     intrinsics: &'a [Intrinsics],

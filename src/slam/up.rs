@@ -1,7 +1,7 @@
-//! Which way is up in a map: what the cameras had above them, refined with the horizontal surfaces of the map.
+//! The upward direction of a map: the mean of the cameras' up vectors, refined with the horizontal surfaces of the map.
 //!
-//! A single camera does not measure gravity. It is carried upright more or less, so the mean of its upper edges is up to
-//! some tens of degrees; floors and tables, where the map has them, tell the rest.
+//! A single camera does not measure gravity. It is carried more or less upright, so the mean of its up vectors is right
+//! to some tens of degrees; floors and tables, where the map has them, give the rest.
 
 use nalgebra::Vector3;
 
@@ -10,33 +10,34 @@ use crate::slam::trajectory::StampedPose;
 /// Length of the mean of the cameras' up vectors below which they agree on no direction.
 const SHORTEST_MEAN: f64 = 0.3;
 
-/// How far up is sought from the cameras' mean, radians, and the least share of the normals that must point there or
+/// Largest angle of up from the cameras' mean, radians, and least share of the normals that must point there or
 /// opposite. A camera that looks at a table is tilted by 30° or so, one that looks at the floor before its feet by 40°;
 /// further off a wall could be taken for a floor. Of evenly spread directions 1.5 % are within the last cone.
 const LIMITS: [(f64, f64); 2] = [(35.0 * DEGREE, 0.05), (50.0 * DEGREE, 0.12)];
 
-/// Surfaces whose normals differ from a direction by less agree with it at first, and in the end: normals of neighbouring
-/// points scatter by some ten degrees. Radians.
+/// Angles below which the normal of a surface agrees with a direction, from the first rounds to the last: normals of
+/// neighbouring points scatter by some ten degrees. Radians.
 const CONES: [f64; 4] = [20.0 * DEGREE, 15.0 * DEGREE, 10.0 * DEGREE, 10.0 * DEGREE];
 
 /// Rounds within each cone.
 const ROUNDS: usize = 4;
 
-/// Normals that are asked: more do not change the direction.
+/// Most normals that are used: more do not change the direction.
 const MOST_NORMALS: usize = 20_000;
 
-/// Directions that are tried as the start, from among the normals.
+/// Most normals that are tried as the initial direction.
 const MOST_STARTS: usize = 200;
 
-/// Fewest normals that are a surface.
+/// Fewest normals of a surface.
 const FEWEST_NORMALS: usize = 100;
 
 const DEGREE: f64 = std::f64::consts::PI / 180.0;
 
-/// The direction that is up, a unit vector in the frame of `poses` and `normals`; `None` where the cameras agree on none.
+/// The upward direction, a unit vector in the coordinates of `poses` and `normals`; `None` where the cameras agree on
+/// none.
 ///
-/// Of the directions near the mean of the cameras' up vectors it is the one that most normals share, pointing up or down,
-/// and the mean itself where too few do. Zero and non-finite normals do not count.
+/// Of the directions near the mean of the cameras' up vectors it is the one that most normals share, pointing up or
+/// down, and the mean itself where too few do. Zero and non-finite normals do not count.
 pub fn up_direction<'a>(
     poses: impl Iterator<Item = &'a StampedPose>,
     normals: impl ExactSizeIterator<Item = [f32; 3]>,
@@ -54,7 +55,7 @@ pub fn up_direction<'a>(
     Some(shared.unwrap_or(mean))
 }
 
-/// The mean of what the cameras had above them.
+/// The mean of the cameras' up vectors.
 fn mean_up<'a>(poses: impl Iterator<Item = &'a StampedPose>) -> Option<Vector3<f64>> {
     let ups = poses.map(|pose| pose.world_from_camera.rotation * -Vector3::y());
     let (sum, count) = ups
@@ -64,7 +65,7 @@ fn mean_up<'a>(poses: impl Iterator<Item = &'a StampedPose>) -> Option<Vector3<f
     (mean.norm() > SHORTEST_MEAN).then(|| mean.normalize())
 }
 
-/// The normal that most have in common, this `share` of them at least; its product with `mean` is more than `least`.
+/// The normal that most have in common, at least `share` of them; its product with `mean` is more than `least`.
 fn shared_normal(
     mean: &Vector3<f64>,
     normals: &[Vector3<f64>],
@@ -83,7 +84,7 @@ fn shared_normal(
     let mut up = *start;
     for cone in CONES.into_iter().flat_map(|cone| [cone; ROUNDS]) {
         let edge = cone.cos();
-        // Those in the middle of the cone count most, so that its edge does not matter.
+        // Normals in the middle of the cone count most, so that its edge does not matter.
         let sum: Vector3<f64> = within(normals, &up, cone)
             .map(|dot| (dot.0.abs() - edge) * dot.0.signum() * dot.1)
             .sum();
@@ -94,7 +95,7 @@ fn shared_normal(
     (is_shared && up.dot(mean) > least).then_some(up)
 }
 
-/// The normals, of either sign, that differ from a direction by less than `cone`, each after its product with it.
+/// The normals, of either sign, that differ from a direction by less than `cone`, each preceded by its product with it.
 fn within<'a>(
     normals: &'a [Vector3<f64>],
     direction: &'a Vector3<f64>,
@@ -125,7 +126,7 @@ mod tests {
         (0..count).map(of).collect()
     }
 
-    /// Cameras that look down by this angle, one hundred in an arc.
+    /// Cameras that look down by this angle, one hundred along an arc.
     fn cameras(tilt: f64) -> Vec<StampedPose> {
         let of = |i: i64| {
             let turn = UnitQuaternion::from_scaled_axis(Vector3::new(0.0, 0.005 * i as f64, 0.0));
@@ -157,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_looks_down_at_a_large_floor_finds_it_and_a_small_one_keeps_the_mean() {
+    fn a_camera_that_looks_down_finds_a_large_floor_and_keeps_the_mean_over_a_small_one() {
         let up = -Vector3::y();
         let poses = cameras(f64::to_radians(-42.0));
         let walls = |count: usize| surface(Vector3::x(), count);

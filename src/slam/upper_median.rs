@@ -2,7 +2,7 @@
 
 use std::cmp::Ordering;
 
-/// The upper median; `None` of nothing. The values are reordered.
+/// The upper median; `None` for no values. The values are reordered.
 pub(in crate::slam) fn upper_median<T: Copy>(
     values: &mut [T],
     order: impl FnMut(&T, &T) -> Ordering,

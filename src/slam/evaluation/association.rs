@@ -1,11 +1,11 @@
-//! Which pose of one trajectory belongs to which of another: nearest stamps, no interpolation.
+//! Matches the poses of two trajectories: nearest stamps, no interpolation.
 
 use crate::slam::trajectory::StampedPose;
 
-/// Pairs (index in the estimate, index in the ground truth) in order of time: matches each pose of the trajectory that has fewer poses (the estimate where both have as many)
-/// with the nearest of the other, where their stamps differ by at most `max_difference_nanos`; the
-/// earlier of two that are equally near. This is the rule of the package `evo`, which may take one
-/// pose of the longer trajectory twice. Both trajectories are in order of their stamps.
+/// Pairs (index in the estimate, index in the ground truth) in order of time: matches each pose of the trajectory with
+/// fewer poses (the estimate where both have as many) with the nearest of the other, if their stamps differ by at most
+/// `max_difference_nanos`; the earlier of two that are equally near. This is the rule of the package `evo`, which may
+/// use one pose of the longer trajectory twice. Both trajectories are in order of their stamps.
 pub fn associate(
     estimate: &[StampedPose],
     truth: &[StampedPose],
@@ -28,8 +28,8 @@ fn matches<'a>(
     })
 }
 
-/// The pose nearest to `nanos`, at most `max_difference_nanos` away; the earlier of two that are
-/// equally near. `poses` are in order of their stamps.
+/// Index of the pose nearest to `nanos`, at most `max_difference_nanos` away; the earlier of two that are equally near.
+/// `poses` are in order of their stamps.
 pub fn nearest(poses: &[StampedPose], nanos: i64, max_difference_nanos: i64) -> Option<usize> {
     let after = poses.partition_point(|pose| pose.nanos < nanos);
     // The first of equal stamps stands for all of them.
@@ -55,7 +55,7 @@ mod tests {
         millis.iter().map(pose).collect()
     }
 
-    /// Pairs of stamps (ground truth, estimate) as `evo` 1.38.1 gave them for the same stamps.
+    /// Pairs of stamps (ground truth, estimate); the expected ones are those of `evo` 1.38.1 for the same stamps.
     fn pairs(truth: &[i64], estimate: &[i64]) -> Vec<(i64, i64)> {
         associate(&stamps(estimate), &stamps(truth), 20_000_000)
             .iter()

@@ -1,4 +1,4 @@
-//! Whether two keyframes give the same place the same depth.
+//! Agreement of the depths of two keyframes where both see the same surface.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -7,27 +7,26 @@ use crate::slam::evaluation::statistics::median;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::Keyframe;
 
-/// Points of a pair that are compared.
+/// Points compared per pair.
 const POINTS: usize = 2000;
-/// Fewest of them that say something.
+/// Fewest points that give a meaningful figure.
 const MIN_POINTS: usize = 50;
 /// Rounds of the robust fit of the tilt.
 const ROUNDS: usize = 5;
 
-/// How the depths of a pair of keyframes agree.
+/// Agreement of the depths of a pair of keyframes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DepthAgreement {
-    /// Median of |ln(d/d′)|, d the inverse depth that the later keyframe has, d′ the one that the earlier
-    /// predicts there.
+    /// Median of |ln(d/d′)|, d the later keyframe's inverse depth, d′ the one that the earlier predicts there.
     pub difference: f64,
     /// Share of the points that agree within three standard deviations of both.
     pub within_3_sigma: f64,
-    /// Length of the slope (X, Y) of ln(d/d′), by ray coordinate: by how much one of the two is tilted. The
-    /// slope along depth is left out: noise alone makes one.
+    /// Length of the slope (X, Y) of ln(d/d′) over the ray coordinates: the tilt of one against the other. The slope
+    /// along depth is left out: noise alone makes one.
     pub tilt: f64,
 }
 
-/// One more than the place of each pixel's point among the keyframe's points; 0 where it has none.
+/// One plus the index of each pixel's point in the keyframe's points; 0 where it has none.
 pub fn point_index(keyframe: &Keyframe) -> Image<u32> {
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
     let mut index = Image::filled(width, height, 0);
@@ -40,7 +39,7 @@ pub fn point_index(keyframe: &Keyframe) -> Image<u32> {
     index
 }
 
-/// Compares a pair; `later` is the index of the later keyframe's points. `None` where too few coincide.
+/// Compares a pair; `later` is the point index of the later keyframe. `None` where too few points coincide.
 pub fn depth_agreement(view: &SharedView<'_>, later: &Image<u32>) -> Option<DepthAgreement> {
     let camera = &view.into.intrinsics;
     let (mut differences, mut rays, mut within) = (Vec::new(), Vec::new(), 0usize);
@@ -50,7 +49,7 @@ pub fn depth_agreement(view: &SharedView<'_>, later: &Image<u32>) -> Option<Dept
         let Some(other) = view.into.points.get((index as usize).wrapping_sub(1)) else { continue };
         let d = f64::from(other.inverse_depth);
         let difference = (d / at.inverse_depth).ln();
-        // Relative variances: that of a carried depth stays about what it was.
+        // Relative variances: that of a propagated depth changes little.
         let relative = |variance: f32, d: f64| f64::from(variance) / (d * d);
         let variance =
             relative(other.variance, d) + relative(point.variance, f64::from(point.inverse_depth));

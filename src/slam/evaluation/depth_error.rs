@@ -10,48 +10,48 @@ use crate::slam::keyframe::Keyframe;
 /// Where a keyframe's scale comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum DepthScale {
-    /// The median ratio of true to estimated depth: the map has no metres of its own.
+    /// The median ratio of true to estimated depth: the map is not metric.
     #[default]
     MedianRatio,
-    /// The keyframe's pose: the poses were given in metres.
+    /// The keyframe's pose: the given poses were in metres.
     Given,
 }
 
-/// The depth of one keyframe against the truth: what all of it has in common.
+/// Errors common to the whole of one keyframe's depth.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct KeyframeDepth {
     /// The keyframe.
     pub keyframe_id: u64,
     /// Its stamp, nanoseconds.
     pub capture_nanos: i64,
-    /// Map units in a true metre: the same everywhere in a map without drift of its scale.
+    /// Map units per true metre: the same for every keyframe of a map without scale drift.
     pub units_per_metre: f64,
-    /// Relative depth error for each unit of the ray along columns, along rows, and for each unit of ln d (relief), as
+    /// Relative depth error per unit of the ray coordinate along columns, along rows, and per unit of ln d (relief), as
     /// [`DepthModes`] defines them; `None` with too few points.
     pub modes: Option<[f64; 3]>,
 }
 
-/// Largest over smallest map unit of the keyframes; `None` below two.
+/// Ratio of the largest to the smallest map unit of the keyframes; `None` for fewer than two.
 pub fn depth_scale_ratio(keyframes: &[KeyframeDepth]) -> Option<f64> {
     largest_over_smallest(keyframes.iter().map(|of| of.units_per_metre))
 }
 
-/// Pixels of one or more keyframes whose true depth is known.
+/// Depth errors over the pixels of one or more keyframes that have true depth.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DepthErrors {
-    /// What each of the keyframes that were compared has in common, in their order.
+    /// The common errors of each keyframe that was compared, in their order.
     pub keyframes: Vec<KeyframeDepth>,
     /// `|z·s − z_true| / z_true`.
     relative_error: Vec<f64>,
     /// σ/d as reported.
     relative_std_dev: Vec<f64>,
-    /// |error of d| / σ.
+    /// |d − d_true| / σ.
     whitened_error: Vec<f64>,
-    /// Magnitudes of the errors common to a keyframe over their standard deviations, of each that has enough points.
+    /// Magnitudes of the common errors over their standard deviations, of each keyframe that has enough points.
     whitened_modes: Vec<[f64; 3]>,
     /// Points, with or without true depth.
     points: usize,
-    /// Pixels of the keyframes.
+    /// Pixels of all keyframes.
     pixels: usize,
 }
 
@@ -68,16 +68,16 @@ pub struct DepthStatistics {
     pub coverage: [f64; 3],
     /// Share of the keyframes' pixels that have depth.
     pub density: f64,
-    /// Medians over the keyframes of the tilt of depth along columns and rows and of the error of its relief,
-    /// as [`DepthModes`] defines them, without their sign; `None` where no keyframe has enough points.
+    /// Medians over the keyframes of the absolute tilt of depth along columns and rows and of the absolute error of its
+    /// relief, as [`DepthModes`] defines them; `None` where no keyframe has enough points.
     pub modes: Option<[f64; 3]>,
-    /// The same over the standard deviation that each keyframe claims: 0.67 is right, more is too sure.
+    /// The same, divided by the standard deviation that each keyframe reports: 0.67 is right, more is overconfident.
     pub whitened_modes: Option<[f64; 3]>,
 }
 
 impl DepthErrors {
-    /// Adds the points of one keyframe. `true_depth` is in metres, 0 or not finite where unknown,
-    /// rectified like the keyframe; one of another size is not compared and adds nothing.
+    /// Adds the points of one keyframe. `true_depth` is in metres, 0 or not finite where unknown, rectified like the
+    /// keyframe; an image of another size adds nothing.
     pub fn add(&mut self, keyframe: &Keyframe, true_depth: &Image<f32>, scale: DepthScale) {
         let (width, height) = (true_depth.width(), true_depth.height());
         if (width, height) != (keyframe.intrinsics.width, keyframe.intrinsics.height) {
@@ -108,7 +108,7 @@ impl DepthErrors {
         if let Some(modes) = modes {
             let (errors, std_devs) = (modes.magnitudes(), keyframe.mode_covariance.std_devs());
             let whitened = std::array::from_fn(|mode| errors[mode] / std_devs[mode]);
-            // A keyframe that claims no uncertainty, as one with a sensor's depth, is not judged by it.
+            // A keyframe that reports no uncertainty, such as one with a sensor's depth, is left out here.
             self.whitened_modes.extend(whitened.iter().all(|e| e.is_finite()).then_some(whitened));
         }
         for Compared { z_true, d, sigma } in compared {
@@ -144,7 +144,7 @@ impl DepthErrors {
     }
 }
 
-/// Medians of each of three figures over all keyframes.
+/// Median of each of three figures over all keyframes.
 fn medians(figures: &[[f64; 3]]) -> Option<[f64; 3]> {
     let of = |mode: usize| median(&figures.iter().map(|modes| modes[mode]).collect::<Vec<_>>());
     Some([of(0)?, of(1)?, of(2)?])
@@ -157,7 +157,7 @@ struct Compared {
     sigma: f64,
 }
 
-/// Metres in a keyframe unit.
+/// Metres per keyframe unit.
 fn metres_per_unit(keyframe: &Keyframe, compared: &[Compared], scale: DepthScale) -> Option<f64> {
     match scale {
         DepthScale::Given => Some(keyframe.map_from_keyframe.scale),
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_by_hand() {
+    fn errors_match_values_computed_by_hand() {
         // True depth 4 m everywhere, unit 2 m: the right inverse depth is 0.5.
         let truth = Image::filled(20, 20, 4.0f32);
         let points = vec![
@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn a_unit_that_drifts_shows_in_the_ratio_of_all() {
+    fn scale_drift_shows_in_the_ratio_of_the_map_units() {
         let truth = Image::filled(20, 20, 4.0f32);
         let mut errors = DepthErrors::default();
         for unit in [2.0, 2.2, 1.6] {
@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn pixels_without_truth_and_hostile_values_are_left_out() {
+    fn pixels_without_truth_and_invalid_values_are_left_out() {
         let mut truth = Image::filled(20, 20, 0.0f32);
         truth.pixels_mut()[3 * 20] = f32::NAN;
         truth.pixels_mut()[3 * 20 + 1] = 2.0;

@@ -1,8 +1,8 @@
 //! Errors of depth that are common to a whole keyframe: tilt along columns and rows, and relief.
 //!
-//! A relative error of depth that is a plane over the image, or grows with depth, looks like camera motion:
-//! poses absorb it and images hardly show it. The median error does not show it either, so it is measured by
-//! itself: the fit `ln(d_true/d) = γ + αX + βY + ρ ln d_true`, X and Y the ray's coordinates.
+//! A relative error of depth that is a plane over the image, or grows with depth, looks like camera motion: poses
+//! absorb it and images hardly show it. The median error does not show it either, so it is measured separately: the fit
+//! `ln(d_true/d) = γ + αX + βY + ρ ln d_true`, X and Y the ray's coordinates.
 
 use nalgebra::{Matrix4, Vector4};
 use serde::{Deserialize, Serialize};
@@ -14,31 +14,31 @@ use crate::slam::upper_median::upper_median;
 /// The common errors of one keyframe's depth.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DepthModes {
-    /// Logarithm of the depth over the true depth, in the middle of the image, at the geometric mean depth.
+    /// Logarithm of estimated over true depth, at the image centre and the geometric mean depth.
     pub scale: f64,
-    /// α: relative depth error for each unit of X, which is f pixels along a row.
+    /// α: relative depth error per unit of X, which is f pixels along a row.
     pub column: f64,
-    /// β: the same along a column.
+    /// β: relative depth error per unit of Y, along a column.
     pub row: f64,
-    /// ρ: relative depth error for each unit of ln d; positive where relief is flattened.
+    /// ρ: relative depth error per unit of ln d; positive where relief is flattened.
     pub relief: f64,
 }
 
-/// Fewer points than this fit anything.
+/// Fewest points for a fit.
 const MIN_POINTS: usize = 50;
-/// Fits, each with the weights of the one before: errors of wrong matches have no bound.
+/// Iterations, each with the weights from the one before: errors of wrong matches are unbounded.
 const ITERATIONS: usize = 10;
-/// Residual with half the weight, in median absolute residuals.
+/// Residual that gets half the weight, in median absolute residuals.
 const HALF_WEIGHT_MEDIANS: f64 = 2.0;
-/// Least error of half the weight: single precision depth is not better, and weights keep their scale.
+/// Smallest error that gets half the weight: single-precision depth is no better, and the weights keep their scale.
 const MIN_HALF_WEIGHT: f64 = 1e-6;
-/// Least standard deviation of X, Y and ln d that the modes before leave over: with less, one cannot be told from
-/// the others. 1 % of depth, or of the focal length along the image.
+/// Smallest standard deviation that X, Y and ln d have left once the preceding modes are projected out: below it, a
+/// mode cannot be told from the others. 1 % of depth, or of the focal length along the image.
 const MIN_SPREAD: f64 = 0.01;
 
 impl DepthModes {
-    /// The modes of `keyframe`, whose depth in metres is `metres_per_unit / d`; `None` where too few points have
-    /// true depth, or all at one depth or in one line.
+    /// The modes of `keyframe`, whose depth in metres is `metres_per_unit / d`; `None` where too few points have true
+    /// depth, or where all are at one depth or on one line.
     pub fn of(keyframe: &Keyframe, true_depth: &Image<f32>, metres_per_unit: f64) -> Option<Self> {
         let mut samples = samples(keyframe, true_depth, metres_per_unit);
         if samples.len() < MIN_POINTS {
@@ -71,8 +71,8 @@ impl DepthModes {
     }
 
     /// Standard deviation, over the points of `keyframe` that have true depth, of the relative error that tilt and
-    /// relief together make of it: where depth is nearly a plane one of them can stand for the other, and only their
-    /// sum says how wrong the shape is.
+    /// relief cause together: where depth is nearly a plane one can stand for the other, and only their sum tells how
+    /// wrong the shape is.
     pub fn spread(&self, keyframe: &Keyframe, true_depth: &Image<f32>) -> f64 {
         let modes = Vector4::new(0.0, self.column, self.row, self.relief);
         let errors: Vec<f64> =
@@ -82,13 +82,13 @@ impl DepthModes {
         (errors.iter().map(|error| (error - mean).powi(2)).sum::<f64>() / count).sqrt()
     }
 
-    /// Tilt along columns and rows and relief, without their sign.
+    /// Absolute values of the tilt along columns and rows and of the relief.
     pub fn magnitudes(&self) -> [f64; 3] {
         [self.column.abs(), self.row.abs(), self.relief.abs()]
     }
 }
 
-/// Of each point with true depth: 1, X, Y and ln d_true, and the logarithm of its depth over the true one.
+/// For each point with true depth: (1, X, Y, ln d_true), and the logarithm of its estimated over its true depth.
 fn samples(
     keyframe: &Keyframe,
     true_depth: &Image<f32>,
@@ -112,11 +112,11 @@ fn samples(
     samples
 }
 
-/// The modes of `normal · modes = right`; `None` where the points do not tell two of them apart.
+/// Solves `normal · modes = right`; `None` where the points cannot tell two of the modes apart.
 fn solve(normal: Matrix4<f64>, right: &Vector4<f64>) -> Option<Vector4<f64>> {
     let factors = normal.cholesky()?;
     let pivots = factors.l_dirty().diagonal().map(|pivot| pivot * pivot);
-    // The first is the sum of the weights, the others sums of squares.
+    // The first pivot is the sum of the weights, the others are sums of squares.
     let is_apart = |k: usize| pivots[k] >= MIN_SPREAD * MIN_SPREAD * pivots[0];
     (1..4).all(is_apart).then(|| factors.solve(right))
 }
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn the_modes_that_were_put_in_come_out_beside_wrong_matches() {
+    fn the_modes_are_recovered_despite_wrong_matches() {
         let put = DepthModes { scale: 0.02, column: 0.1, row: -0.05, relief: 0.2 };
         for wrong_share in [0.0, 0.1] {
             let (keyframe, truth) = keyframe(&put, wrong_share);
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn depth_that_cannot_be_compared_has_none() {
+    fn depth_that_cannot_be_compared_has_no_modes() {
         let exact = DepthModes { scale: 0.0, column: 0.0, row: 0.0, relief: 0.0 };
         let (mut keyframe, mut truth) = keyframe(&exact, 0.0);
         assert!(DepthModes::of(&keyframe, &Image::filled(1, 1, 2.0), 2.0).is_none());
@@ -195,7 +195,7 @@ mod tests {
         assert!(DepthModes::of(&keyframe, &truth, 2.0).is_none());
     }
 
-    /// What is left of `keyframe` where `is_seen`, with the errors of real depth, and its true depth at 2.7 m.
+    /// The points of `keyframe` for which `is_seen` holds, with the errors of real depth, and its true depth at 2.7 m.
     fn wall(is_seen: impl Fn(&DepthPoint) -> bool) -> (Keyframe, Image<f32>) {
         let put = DepthModes { scale: 0.02, column: 0.1, row: -0.05, relief: 0.2 };
         let (mut keyframe, mut truth) = keyframe(&put, 0.1);
@@ -208,7 +208,7 @@ mod tests {
     fn a_wall_at_one_depth_has_no_relief() {
         let (keyframe, mut truth) = wall(|_| true);
         assert_eq!(DepthModes::of(&keyframe, &truth, 2.0), None);
-        // Not in the last bit of single precision either.
+        // Nor does the last bit of single precision make one.
         truth.pixels_mut().iter_mut().step_by(3).for_each(|z| *z = z.next_up());
         assert_eq!(DepthModes::of(&keyframe, &truth, 2.0), None);
         // A wall that is not flat has some.
@@ -228,10 +228,10 @@ mod tests {
     }
 
     #[test]
-    fn depth_without_an_error_is_weighed_like_any_other() {
+    fn exact_depths_weigh_like_any_other() {
         let exact = DepthModes { scale: 0.0, column: 0.0, row: 0.0, relief: 0.0 };
         let (mut keyframe, mut truth) = keyframe(&exact, 0.0);
-        // Most of it is exact to the last bit, and of one depth: the rest must not lose its weight.
+        // Most depths are exact to the last bit, and equal: the rest must not lose their weight.
         for (k, (point, z)) in keyframe.points.iter_mut().zip(truth.pixels_mut()).enumerate() {
             *z = if k % 4 == 0 { 4.0 } else { 2.0 };
             let error = if k % 8 == 0 { 1e-9 } else { 0.0 };

@@ -1,4 +1,4 @@
-//! A trajectory of several epochs against ground truth: each has an origin and a unit of its own, and is aligned by itself.
+//! A trajectory of several epochs against ground truth: each has its own origin and unit, and is aligned separately.
 
 use crate::slam::evaluation::measured::Measured;
 use crate::slam::evaluation::umeyama::TrajectoryAlignment;
@@ -11,9 +11,9 @@ use crate::slam::trajectory::{EpochPose, StampedPose, by_epoch};
 pub struct EpochEvaluation {
     /// The epoch.
     pub epoch: u32,
-    /// Poses that it has.
+    /// Number of its poses.
     pub poses: usize,
-    /// Its errors, or why it is left out: too few poses with ground truth, or none that fix an alignment.
+    /// Its errors, or why it is left out: too few poses with ground truth, or poses that do not determine an alignment.
     pub result: Result<TrajectoryEvaluation, EvaluationError>,
 }
 
@@ -22,10 +22,10 @@ pub struct EpochEvaluation {
 pub struct EpochsEvaluation {
     /// Every epoch, in the order of their numbers.
     pub epochs: Vec<EpochEvaluation>,
-    /// The poses of the epochs that are not left out, epoch after epoch, each epoch brought to the truth by its own alignment.
+    /// The poses of the epochs that are not left out, epoch after epoch, each transformed by its own alignment.
     pub placed: Vec<EpochPose>,
-    /// Errors of `placed`, whose alignment is the identity: over all matches of all epochs. No relative error and no window
-    /// spans two of them, and window scales are relative to that of their epoch.
+    /// Errors of `placed`, whose alignment is the identity, over all matches of all epochs. No relative error and no
+    /// window spans two epochs, and window scales are relative to the scale of their epoch.
     pub total: TrajectoryEvaluation,
 }
 
@@ -36,8 +36,8 @@ impl EpochsEvaluation {
     }
 }
 
-/// Compares every epoch of `estimate` with `truth`, as [`evaluate_trajectory`](super::evaluate_trajectory) does with one. An
-/// epoch that cannot be aligned is left out; it is an error where all are.
+/// Compares every epoch of `estimate` with `truth`, as [`evaluate_trajectory`](super::evaluate_trajectory) does for a
+/// single one. An epoch that cannot be aligned is left out; it is an error if none can.
 pub fn evaluate_epochs(
     estimate: &[EpochPose],
     truth: &[StampedPose],
@@ -68,7 +68,7 @@ fn place(epoch: u32, pose: &StampedPose, truth_from_epoch: &Sim3) -> EpochPose {
     EpochPose { epoch, pose: StampedPose { nanos: pose.nanos, world_from_camera } }
 }
 
-/// Why nothing can be compared: what is wrong with the longest epoch.
+/// Why nothing can be compared: the reason of the longest epoch.
 fn none_aligned(
     epochs: Vec<EpochEvaluation>,
     estimated: usize,
@@ -121,8 +121,8 @@ mod tests {
     }
 
     #[test]
-    fn each_epoch_is_aligned_by_itself_and_the_total_is_over_all_matches() {
-        // The first epoch is taken up again after the second.
+    fn each_epoch_is_aligned_separately_and_the_total_is_over_all_matches() {
+        // The first epoch continues after the second.
         let (begin, end) = (path(0..60, false), path(200..280, false));
         let first = of_epoch(0, &[begin, end].concat(), 0.5);
         let second = of_epoch(3, &path(100..180, false), 20.0);
@@ -134,7 +134,7 @@ mod tests {
         }
         let count = |of: &EpochEvaluation| (of.epoch, of.poses);
         assert_eq!(result.epochs.iter().map(count).collect::<Vec<_>>(), [(0, 140), (3, 80)]);
-        // Each is what it is alone; the total is the mean of the squares of all matches.
+        // Each has the errors that it has alone; the total is the mean of the squares of all matches.
         let alone = |poses: &[EpochPose]| {
             let poses: Vec<StampedPose> = poses.iter().map(|of| of.pose).collect();
             let truth = path(0..300, true);

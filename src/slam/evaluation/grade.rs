@@ -1,7 +1,7 @@
-//! Grade of a run by what can be known without ground truth: good, doubtful, poor, or not judged.
+//! Grade of a run from what can be measured without ground truth: good, doubtful, poor, or not judged.
 //!
-//! Nothing is good by default: a map whose keyframes never see the same place from apart is not judged.
-//! `docs/grade.md` holds the grades of all sequences against their truth, and what the grade cannot see.
+//! Nothing is good by default: a map without distant keyframes that see the same place is not judged. `docs/grade.md`
+//! lists the grades of all sequences against their truth, and what the grade cannot see.
 
 use serde::{Deserialize, Serialize};
 
@@ -10,17 +10,17 @@ use crate::slam::evaluation::map_consistency::MapConsistency;
 
 /// Fewest wide pairs: three come with the fourth keyframe that shares a view.
 const MIN_WIDE_PAIRS: u64 = 3;
-/// Misfit of wide pairs up to which a map is good, as a share of the image's width: 2.6 px of 640. Where the
-/// map is right, what remains is patches that deform between the views: 1 to 2 px.
+/// Misfit of wide pairs up to which a map is good, as a share of the image's width: 2.6 px of 640. Where the map is
+/// right, what remains comes from patches that deform between the views: 1 to 2 px.
 const GOOD_MISFIT: f64 = 0.004;
-/// Misfit from which a map is poor: 8 px of 640, two thirds of what is searched along an axis. Shifts that
-/// have nothing to do with the place have their median at 9 px, so that hardly any agreement is left.
+/// Misfit from which a map is poor: 8 px of 640, two thirds of the search range along an axis. Shifts unrelated to the
+/// place have their median at 9 px, so hardly any agreement is left.
 const POOR_MISFIT: f64 = 0.0125;
-/// Share of the frames lost, of those after the first pose, from which a run is poor: a robot is blind
-/// for every tenth frame.
+/// Share of frames lost, of those after the first pose, above which a run is poor: a robot is blind for every tenth
+/// frame.
 const POOR_LOST: f64 = 0.1;
 
-/// How good.
+/// The levels of a grade.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum GradeLevel {
     /// There is too little to judge by.
@@ -38,7 +38,7 @@ pub enum GradeLevel {
 }
 
 impl GradeLevel {
-    /// In words.
+    /// The level in words.
     pub fn name(self) -> &'static str {
         match self {
             Self::Good => "good",
@@ -49,39 +49,39 @@ impl GradeLevel {
     }
 }
 
-/// What a grade is made from.
+/// The figures that a grade is computed from.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct GradeInput {
-    /// Frames with a pose, claimed when they came or found afterwards.
+    /// Frames with a pose, claimed in real time or found afterwards.
     pub frames_tracked: u64,
     /// Frames without one because tracking was lost.
     pub frames_lost: u64,
-    /// How often tracking was lost.
+    /// Number of times that tracking was lost.
     pub losses: u64,
-    /// Parts of the map with a frame and a scale of their own.
+    /// Parts of the map, each with its own coordinate frame and scale.
     pub epochs: u64,
-    /// Whether poses were given: then all parts have their scale.
+    /// Whether poses were given: then all parts are to scale.
     pub are_poses_given: bool,
-    /// How often the map was found to contradict itself; 0 where that is not known.
+    /// Number of times that the map was found to contradict itself; 0 where unknown.
     pub rejections: u64,
-    /// First to last frame.
+    /// Frames from the first to the last.
     pub frames: u64,
     /// Width of the images, pixels.
     pub width: usize,
-    /// How keyframes agree.
+    /// Agreement of the keyframes.
     pub consistency: MapConsistency,
 }
 
 /// The grade of a run, why, and the figures behind it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Grade {
-    /// How good.
+    /// The level.
     pub level: GradeLevel,
-    /// Why, the gravest first, in words.
+    /// The reasons, the gravest first, in words.
     pub reasons: Vec<String>,
     /// What this grade cannot see, in words.
     pub caveat: String,
-    /// Figures of the keyframes against each other.
+    /// Figures of the comparison of keyframes.
     pub figures: MapConsistency,
 }
 
@@ -106,7 +106,7 @@ impl Grade {
         let is_judged = findings.iter().all(|(level, _)| *level != GradeLevel::NotJudged);
         let is_certain = worst > GradeLevel::Good || is_judged;
         let level = if is_certain { worst } else { GradeLevel::NotJudged };
-        // The gravest first, and nothing good beside it.
+        // The gravest first; a good finding is listed only if the grade is good.
         findings.sort_by_key(|(level, _)| std::cmp::Reverse(*level));
         findings.retain(|(of, _)| level == GradeLevel::Good || *of != GradeLevel::Good);
         Self {
@@ -118,7 +118,7 @@ impl Grade {
     }
 }
 
-/// What the keyframes say.
+/// Finding from the agreement of the keyframes.
 fn misfit(input: &GradeInput) -> (GradeLevel, String) {
     let figures = &input.consistency;
     if input.frames_tracked == 0 {
@@ -145,7 +145,7 @@ fn misfit(input: &GradeInput) -> (GradeLevel, String) {
     (level, reason)
 }
 
-/// What the losses say.
+/// Finding from the losses of tracking.
 fn losses(input: &GradeInput) -> Option<(GradeLevel, String)> {
     let after_start = input.frames_tracked + input.frames_lost;
     if input.frames_lost == 0 || input.frames_tracked == 0 {
@@ -160,7 +160,7 @@ fn losses(input: &GradeInput) -> Option<(GradeLevel, String)> {
     ))
 }
 
-/// What the grade is blind to.
+/// What the grade cannot see, in words.
 fn caveat(input: &GradeInput) -> String {
     let (span, frames) = (input.consistency.longest_span_frames, input.frames);
     if span == 0 {
@@ -231,7 +231,7 @@ mod tests {
         }
         short.consistency = MapConsistency::default();
         assert_eq!(Grade::of(&short).level, GradeLevel::NotJudged);
-        // But what is known to be bad is said.
+        // What is known to be bad is reported all the same.
         let lost = Grade::of(&GradeInput { frames_lost: 60, losses: 1, ..short });
         assert_eq!(lost.level, GradeLevel::Poor);
         assert!(
@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn losses_parts_and_contradictions_cost_the_good_grade() {
+    fn losses_parts_and_contradictions_prevent_a_good_grade() {
         let good = input(1.0);
         for (worse, word, level) in [
             (

@@ -1,8 +1,8 @@
-//! What a map says about itself: whether keyframes that see the same place agree about it.
+//! Consistency of a map: whether keyframes that see the same place agree about it.
 //!
-//! No ground truth is needed. Consecutive keyframes agree by construction, the later depth is carried from
-//! the earlier; keyframes further apart have come to their poses and scales over different paths, and
-//! whatever drifted between them shows as a misfit in pixels.
+//! No ground truth is needed. Consecutive keyframes agree by construction, as the later depth is propagated from the
+//! earlier; keyframes further apart got their poses and scales along different paths, and whatever drifted between them
+//! shows as a misfit in pixels.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -13,18 +13,18 @@ use crate::slam::evaluation::shared_view::{Pair, SharedView, pairs};
 use crate::slam::evaluation::statistics::median;
 use crate::slam::keyframe::Keyframe;
 
-/// Agreement over the pairs of a map: medians. A wide pair has other keyframes between.
+/// Agreement over the pairs of a map: medians. A wide pair has other keyframes in between.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct MapConsistency {
     /// Wide pairs that share at least 30 % of their view and have enough texture.
     pub wide_pairs: u64,
-    /// Frames between the keyframes of the widest of them: drift that takes longer is not seen.
+    /// Frames between the keyframes of the widest of these pairs: drift that takes longer is not seen.
     pub longest_span_frames: u64,
-    /// Shift between where the map puts a place in the later image and where it is, pixels; wide pairs. Shifts
-    /// beyond 1.9 % of the width (12 px of 640) along an axis are not looked for: a median of three quarters of
+    /// Shift between where the map predicts a patch in the later image and where it is found, pixels; wide pairs.
+    /// Shifts beyond 1.9 % of the width (12 px of 640) along an axis are not searched: a median of three quarters of
     /// that is no agreement at all.
     pub wide_misfit_px: Option<f64>,
-    /// The same of neighbouring keyframes.
+    /// The same for neighbouring keyframes.
     pub near_misfit_px: Option<f64>,
     /// Share of the patches of wide pairs whose texture was found within that reach.
     pub wide_found: Option<f64>,
@@ -37,7 +37,7 @@ pub struct MapConsistency {
 }
 
 impl MapConsistency {
-    /// Measures it: 2 to 4 ms a pair of 640 columns, at most four pairs for each of sixty keyframes.
+    /// Measures a map: 2 to 4 ms per pair at 640 columns, at most four pairs for each of sixty keyframes.
     pub fn measure(keyframes: &[Keyframe]) -> Self {
         let pairs = pairs(keyframes);
         let of_each: Vec<_> = pairs.chunk_by(|a, b| a.later == b.later).collect();
@@ -65,12 +65,12 @@ impl MapConsistency {
     }
 }
 
-/// What a pair came to.
+/// Result of comparing a pair.
 struct Compared {
     is_wide: bool,
     span_frames: u64,
     misfit: PatchMisfit,
-    /// Of a wide pair where enough depths coincide.
+    /// For a wide pair where enough depths coincide.
     depth: Option<DepthAgreement>,
 }
 
@@ -114,8 +114,7 @@ mod tests {
         (128.0 + 20.0 * sum) as u8
     }
 
-    /// A keyframe in front of the wall, which the map holds to be at `x` and to have this scale and
-    /// depth.
+    /// A keyframe in front of the wall that the map places at `x`, with this scale and depth.
     fn keyframe(index: u64, x: f64, scale: f64, depth: impl Fn(f64) -> f64) -> Keyframe {
         let truth = STEP * index as f64;
         let ray = |at: usize, side: usize| (at as f64 - 0.5 * (side as f64 - 1.0)) / FOCAL;
@@ -141,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn a_right_map_agrees_with_itself() {
+    fn a_correct_map_agrees_with_itself() {
         let map: Vec<_> = (0..5).map(|i| keyframe(i, STEP * i as f64, 1.0, |_| 1.0)).collect();
         let figures = MapConsistency::measure(&map);
         assert_eq!((figures.wide_pairs, figures.longest_span_frames), (6, 40));
@@ -155,7 +154,7 @@ mod tests {
 
     #[test]
     fn a_drift_of_position_scale_or_tilt_shows_between_distant_keyframes() {
-        // Each step a tenth longer than the one before, as with a scale that grows while depth does not.
+        // Each step is a tenth longer than the one before, as with a scale that grows while depth does not.
         let stretched = |i: u64| (0..i).map(|k| STEP * 1.1f64.powi(k as i32)).sum::<f64>();
         let map: Vec<_> = (0..5).map(|i| keyframe(i, stretched(i), 1.0, |_| 1.0)).collect();
         let figures = MapConsistency::measure(&map);
@@ -175,10 +174,10 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_compared_is_left_out() {
+    fn keyframes_that_cannot_be_compared_are_left_out() {
         assert_eq!(MapConsistency::measure(&[]), MapConsistency::default());
         let mut map: Vec<_> = (0..5).map(|i| keyframe(i, STEP * i as f64, 1.0, |_| 1.0)).collect();
-        // Given up for memory; of another epoch; unproven; looking elsewhere; broken numbers.
+        // Depth dropped to save memory; another epoch; not established; a different view; non-finite values.
         map[0].forget_depth();
         map[1].epoch = 1;
         map[2].map_state = MapState::Rejected;

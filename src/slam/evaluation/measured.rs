@@ -1,5 +1,5 @@
-//! What the figures of a trajectory are made of: the errors of the poses that were aligned together, or of several epochs,
-//! each aligned by itself.
+//! The errors behind a trajectory's figures: of poses that were aligned together, or of several epochs, each aligned
+//! separately.
 
 use crate::slam::evaluation::association::associate;
 use crate::slam::evaluation::statistics::{ErrorStatistics, largest_over_smallest, median};
@@ -12,13 +12,13 @@ use crate::slam::evaluation::{EvaluationError, TrajectoryEvaluation};
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::trajectory::StampedPose;
 
-/// Interval of the second relative error: long enough that drift shows above noise.
+/// Interval of the second relative error: long enough for drift to exceed noise.
 const INTERVAL_NANOS: i64 = 1_000_000_000;
 
 /// Matches and the errors at them.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Measured {
-    /// (index in the estimate, index in the ground truth)
+    /// (index in the estimate, index in the ground truth).
     pairs: Vec<(usize, usize)>,
     absolute: Vec<f64>,
     frames: RelativeErrors,
@@ -29,7 +29,7 @@ pub(super) struct Measured {
 }
 
 impl Measured {
-    /// The errors of `estimate` once it is aligned, and `truth_from_estimate`.
+    /// The errors of `estimate` after alignment, and `truth_from_estimate`.
     pub(super) fn new(
         estimate: &[StampedPose],
         truth: &[StampedPose],
@@ -66,8 +66,8 @@ impl Measured {
         Ok((measured, truth_from_estimate))
     }
 
-    /// Adds another epoch, whose poses stand after `poses` others. The scale of a window is then relative to that of its
-    /// epoch, as units of epochs have nothing to do with each other.
+    /// Adds another epoch, whose poses follow `poses` others. A window's scale becomes relative to that of its epoch,
+    /// as the units of two epochs are unrelated.
     pub(super) fn append(&mut self, epoch: &Self, scale: f64, poses: usize) {
         let matches = self.absolute.len();
         self.pairs.extend(epoch.pairs.iter().map(|&(e, t)| (e + poses, t)));
@@ -80,7 +80,7 @@ impl Measured {
         self.shape.extend(&epoch.shape);
     }
 
-    /// The statistics. `alignment` brought the estimate to the truth.
+    /// The statistics. `alignment` is the one that brought the estimate to the truth.
     pub(super) fn evaluation(
         self,
         alignment: Sim3,

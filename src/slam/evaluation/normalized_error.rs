@@ -1,8 +1,8 @@
-//! Pose errors against the covariance that was reported: normalised estimation errors squared (NEES).
+//! Pose errors against the reported covariance: normalised estimation errors squared (NEES).
 //!
-//! e = log(T_est T_true⁻¹), T = current_from_keyframe with its translation in keyframe units. With a
-//! right covariance eᵀ Σ⁻¹ e is χ² distributed: 6 in the mean, 3 for translation and rotation
-//! alone, and below 12.6 in 95 % of the frames. The same of `map_from_camera`, whose errors are its left increments.
+//! e = log(T_est T_true⁻¹), T = current_from_keyframe with its translation in keyframe units. With a correct covariance
+//! eᵀ Σ⁻¹ e is χ² distributed: mean 6, and 3 for translation or rotation alone, and below 12.6 in 95 % of the frames.
+//! The same for `map_from_camera`, whose errors are its left increments.
 
 use std::collections::BTreeMap;
 
@@ -15,10 +15,10 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::pose::{PoseEstimate, full_covariance};
 use crate::slam::trajectory::StampedPose;
 
-/// What 95 of 100 values of χ²₆ do not exceed.
+/// The 95 % quantile of χ²₆.
 pub const CHI_SQUARE_BOUND: f64 = 12.6;
 
-/// Frames on a keyframe below which the fit of its scale would swallow their error.
+/// Frames on a keyframe below which the fit of its scale would absorb their error.
 pub(super) const LEAST_FRAMES: usize = 5;
 
 /// Normalised errors over many frames.
@@ -26,9 +26,9 @@ pub(super) const LEAST_FRAMES: usize = 5;
 pub struct NormalizedErrors {
     /// Frames compared.
     pub frames: usize,
-    /// Mean of all six unknowns; 6 is right.
+    /// Mean over all six unknowns; 6 is right.
     pub mean: f64,
-    /// Median of all six; 5.3 is right.
+    /// Median over all six; 5.3 is right.
     pub median: f64,
     /// Mean of the translation alone; 3 is right.
     pub translation: f64,
@@ -39,7 +39,7 @@ pub struct NormalizedErrors {
 }
 
 impl NormalizedErrors {
-    /// Over (all, translation, rotation) of each frame; `None` of none.
+    /// Statistics over the (all, translation, rotation) errors of each frame; `None` for no frames.
     pub fn of(errors: &[[f64; 3]]) -> Option<Self> {
         let mean = |part: usize| errors.iter().map(|e| e[part]).sum::<f64>() / errors.len() as f64;
         let all: Vec<f64> = errors.iter().map(|error| error[0]).collect();
@@ -55,8 +55,8 @@ impl NormalizedErrors {
     }
 }
 
-/// eᵀ Σ⁻¹ e of (all six, translation, rotation) for an error (translation, rotation) and the upper
-/// triangle, row by row, of its covariance; `None` where that cannot be inverted.
+/// eᵀ Σ⁻¹ e of (all six, translation, rotation) for an error (translation, rotation) and the upper triangle, row by
+/// row, of its covariance; `None` where a block cannot be inverted.
 pub fn normalized(error: &Vector6<f64>, covariance: &[f64; 21]) -> Option<[f64; 3]> {
     let covariance = full_covariance(covariance);
     let all = error.dot(&(covariance.try_inverse()? * error));
@@ -69,10 +69,9 @@ pub fn normalized(error: &Vector6<f64>, covariance: &[f64; 21]) -> Option<[f64; 
     errors.iter().all(|error| error.is_finite()).then_some(errors)
 }
 
-/// Normalised errors of `estimates` (tracked frames of one epoch), whose keyframes are given as (id,
-/// stamp), against `truth`. A keyframe unit has the length that fits the true translations best in
-/// the least-squares sense, one for each keyframe; keyframes with fewer than five frames are left out. `None` where
-/// nothing can be compared.
+/// Normalised errors of `estimates` (tracked frames of one epoch), whose keyframes are given as (id, stamp), against
+/// `truth`. The length of each keyframe's unit is the one that fits the true translations best in the least-squares
+/// sense; keyframes with fewer than five frames are left out. `None` where nothing can be compared.
 pub fn normalized_errors(
     estimates: &[&PoseEstimate],
     keyframes: &[(u64, i64)],
@@ -106,9 +105,9 @@ pub fn normalized_errors(
     NormalizedErrors::of(&errors)
 }
 
-/// Normalised errors of `map_from_camera` of `estimates` (tracked frames of one epoch), as it was published, against
-/// `truth` in the map: turned by the mean of the rotations between the two, and then where positions are nearest to each
-/// other. `None` where nothing can be compared.
+/// Normalised errors of the published `map_from_camera` of `estimates` (tracked frames of one epoch) against `truth` in
+/// the map: rotated by the mean of the rotations between the two, then scaled and translated by least squares on the
+/// positions. `None` where nothing can be compared.
 pub fn map_normalized_errors(
     estimates: &[&PoseEstimate],
     truth: &[StampedPose],
@@ -128,8 +127,8 @@ pub fn map_normalized_errors(
     NormalizedErrors::of(&errors.collect::<Vec<_>>())
 }
 
-/// `found_from_exact` of poses of one camera. Positions alone leave the rotation about a straight path open, and turn the
-/// map by a few of their errors over its length, far beyond what rotations are uncertain by.
+/// `found_from_exact` of poses of one camera. Positions alone leave the rotation about a straight path open, and rotate
+/// the map by a multiple of their errors over its length, far beyond the uncertainty of the rotations.
 fn similarity(poses: impl Iterator<Item = (SE3, SE3)> + Clone) -> Option<Sim3> {
     let count = poses.clone().count() as f64;
     let turned = |(found, exact): (SE3, SE3)| (found * exact.inverse()).rotation_matrix();
@@ -150,7 +149,7 @@ fn similarity(poses: impl Iterator<Item = (SE3, SE3)> + Clone) -> Option<Sim3> {
     Some(Sim3::new(SE3 { rotation, translation }, scale)).filter(Sim3::is_valid)
 }
 
-/// Length of a keyframe unit in the truth's: s of min Σ |s t_est − t_true|²; `None` where it is not positive.
+/// Length of a keyframe unit in the truth's unit: s of min Σ |s t_est − t_true|²; `None` where it is not positive.
 pub(super) fn unit_length(frames: &[(&PoseEstimate, SE3)]) -> Option<f64> {
     let (mut product, mut squared) = (0.0, 0.0);
     for (estimate, current_from_keyframe) in frames {
@@ -220,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_of_the_size_that_was_said_are_six_in_the_mean() {
+    fn errors_of_the_reported_size_have_a_mean_of_six() {
         let (truth, mut estimates, keyframes) = run(40);
         let measure = |estimates: &[PoseEstimate], truth: &[StampedPose]| {
             let estimates: Vec<&PoseEstimate> = estimates.iter().collect();
@@ -241,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_of_places_in_the_map_are_six_in_the_mean_wherever_the_map_lies() {
+    fn map_pose_errors_have_a_mean_of_six_wherever_the_map_lies() {
         let (truth, mut estimates, _) = run(40);
         let twist = Vector6::new(4.0, -2.0, 1.0, 0.5, -1.0, 0.3);
         let map_from_truth = Sim3::new(SE3::exp(&twist), 0.4);

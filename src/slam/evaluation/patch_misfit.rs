@@ -1,58 +1,57 @@
-//! How far the image of a place lies from where the map puts it.
+//! Misfit between where the map predicts a patch and where the image shows it.
 //!
-//! Patches of the earlier keyframe, 5 × 5 pixels of the reduced image, are warped into the later one by the
-//! final poses and their depth, and the shift with the highest normalised correlation (ZNCC) around that place
-//! is found: where poses, scales and depth agree it is zero. Gain and offset of the camera drop out.
-//! Images are reduced to about 320 columns, so that the time and the reach do not depend on the camera.
+//! Patches of the earlier keyframe, 5 × 5 pixels of the reduced image, are warped into the later one by the final poses
+//! and their depth, and the shift with the highest normalised correlation (ZNCC) around that position is searched:
+//! where poses, scales and depth agree it is zero. Gain and offset of the camera drop out. Images are reduced to about
+//! 320 columns, so that neither the time nor the reach depends on the camera.
 
 use crate::slam::evaluation::shared_view::SharedView;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::Keyframe;
 
-/// Columns of the reduced image, about.
+/// Approximate number of columns of the reduced image.
 const REDUCED_WIDTH: usize = 320;
-/// Largest shift along each axis as a share of the image's width: 12 px of 640. Beyond, repeated texture
-/// is found as often as the place itself.
+/// Largest shift along each axis as a share of the image's width: 12 px of 640. Beyond, repeated texture is found as
+/// often as the patch itself.
 pub const REACH: f64 = 0.01875;
 /// Half side of a patch, reduced pixels.
 const HALF_PATCH: i32 = 2;
 /// Pixels of a patch.
 const PATCH: usize = 25;
-/// Patches of a pair: their median shift is known to a tenth of itself.
+/// Patches per pair: their median shift is accurate to a tenth of its value.
 const PATCHES: usize = 64;
 /// Points among which those with the most structure in both directions are chosen.
 const CANDIDATES: usize = 400;
 /// Correlation from which a patch counts as found; unrelated texture stays below in a search of this size.
 const FOUND: f64 = 0.8;
-/// Fewest patches of which a median is taken.
+/// Fewest patches for a median.
 const MIN_PATCHES: usize = 16;
-/// Share of the patches that must be found for their shifts to say anything; else the pair counts with
-/// the reach.
+/// Smallest share of patches found for their shifts to mean anything; below, the reach stands in for the median.
 const MIN_FOUND: f64 = 0.3;
-/// How a pair of keyframes fits in the image.
+/// Misfit of a pair of keyframes in the image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PatchMisfit {
     /// Median shift of the patches that were found, pixels of the full image; the reach of the search
     /// where hardly any was.
     pub median_px: f64,
-    /// Share of the patches that were found at all.
+    /// Share of the patches that were found.
     pub found: f64,
-    /// Whether there are enough patches to say anything.
+    /// Whether there are enough patches for a meaningful median.
     pub has_texture: bool,
 }
 
-/// A keyframe's image with fewer pixels.
+/// A keyframe's image at reduced resolution.
 #[derive(Debug, Clone)]
 pub struct ReducedImage {
     image: Image<f32>,
-    /// Pixels of the full image along a side of a pixel.
+    /// Side of a reduced pixel, full-resolution pixels.
     factor: usize,
     /// Largest shift, reduced pixels.
     radius: usize,
 }
 
 impl ReducedImage {
-    /// Means of squares of pixels. The image must have the size of the intrinsics.
+    /// Averages blocks of pixels. The image must have the size of the intrinsics.
     pub fn of(keyframe: &Keyframe) -> Self {
         let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
         let factor = ((width + REDUCED_WIDTH / 2) / REDUCED_WIDTH).max(1);
@@ -68,13 +67,13 @@ impl ReducedImage {
         Self { image, factor, radius }
     }
 
-    /// The coordinate of a pixel of the full image.
+    /// Converts a full-resolution pixel coordinate.
     fn reduced(&self, x: f64) -> f32 {
         ((x + 0.5) / self.factor as f64 - 0.5) as f32
     }
 }
 
-/// A patch of the earlier keyframe: its pixels less their mean, and where each falls in the later one.
+/// A patch of the earlier keyframe: its pixels minus their mean, and their projections into the later one.
 struct Patch {
     pixels: [f32; PATCH],
     norm: f32,
@@ -100,13 +99,13 @@ pub fn patch_misfit(
     let mut shifts: Vec<f64> = patches.iter().filter_map(|p| best_shift(p, later)).collect();
     let found = shifts.len() as f64 / patches.len().max(1) as f64;
     shifts.sort_by(f64::total_cmp);
-    // A place that is hidden from one of the two is not found either: few of a good pair are.
+    // Patches that one of the two does not see are not found either: of a good pair these are few.
     let reach_px = REACH * view.into.intrinsics.width as f64;
     let median_px = if found < MIN_FOUND { reach_px } else { shifts[shifts.len() / 2] };
     PatchMisfit { median_px, found, has_texture: patches.len() >= MIN_PATCHES }
 }
 
-/// The patch around a pixel of full resolution; `None` at the rim of either image or without structure.
+/// The patch around a full-resolution pixel; `None` near the edge of either image or without structure.
 fn patch(
     view: &SharedView<'_>,
     earlier: &ReducedImage,
@@ -122,7 +121,7 @@ fn patch(
         *pixel = sample(&earlier.image, earlier.reduced(u), earlier.reduced(v))?;
         let projection = view.project(u, v, inverse_depth)?;
         *place = [later.reduced(projection.u), later.reduced(projection.v)];
-        // All shifts must stay inside.
+        // Every shift must stay inside.
         let reach = later.radius as f32 + 1.0;
         let inside = |x: f32, side: usize| x >= reach && x < side as f32 - 1.0 - reach;
         if !(inside(place[0], later.image.width()) && inside(place[1], later.image.height())) {
@@ -136,7 +135,7 @@ fn patch(
     (structure > 0.0).then_some(Patch { pixels, norm, places, structure })
 }
 
-/// The smaller eigenvalue of Σ ∇I ∇Iᵀ: large where a shift in any direction shows.
+/// The smaller eigenvalue of Σ ∇I ∇Iᵀ: large where a shift in any direction is visible.
 fn smallest_eigenvalue(pixels: &[f32; PATCH]) -> f32 {
     let (mut a, mut b, mut c) = (0.0, 0.0, 0.0);
     for row in 1..4 {
@@ -173,7 +172,7 @@ fn best_shift(patch: &Patch, later: &ReducedImage) -> Option<f64> {
     Some(later.factor as f64 * along.hypot(across))
 }
 
-/// Where the parabola through three scores peaks, −½ to ½.
+/// Position of the peak of the parabola through three scores, −½ to ½.
 fn peak(before: f32, at: f32, after: f32) -> f64 {
     let curvature = f64::from(before - 2.0 * at + after);
     if curvature >= 0.0 {
@@ -182,9 +181,9 @@ fn peak(before: f32, at: f32, after: f32) -> f64 {
     (0.5 * f64::from(before - after) / curvature).clamp(-0.5, 0.5)
 }
 
-/// ZNCC of a patch with the image at its places, shifted.
+/// ZNCC of a patch with the image at its projected positions, shifted.
 fn correlation(patch: &Patch, image: &Image<f32>, shift: [f32; 2]) -> f32 {
-    /// Keeps a flat image from dividing by zero, grey levels.
+    /// Avoids division by zero in a flat image, grey levels.
     const FLAT: f32 = 1e-3;
     let (mut sum, mut squared, mut product) = (0.0f32, 0.0f32, 0.0f32);
     for (pixel, place) in patch.pixels.iter().zip(&patch.places) {
@@ -199,7 +198,7 @@ fn correlation(patch: &Patch, image: &Image<f32>, shift: [f32; 2]) -> f32 {
     product / (variance.sqrt() * patch.norm + FLAT)
 }
 
-/// Bilinear; `None` outside.
+/// Bilinear interpolation; `None` outside the image.
 #[inline]
 fn sample(image: &Image<f32>, u: f32, v: f32) -> Option<f32> {
     if !(u >= 0.0 && v >= 0.0) {

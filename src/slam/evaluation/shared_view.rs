@@ -1,19 +1,18 @@
-//! Which keyframes see the same place, and where a point of one falls in the other.
+//! Pairs of keyframes that share a view, and the projection of points from one into the other.
 
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 
-/// Smallest share of the points of each keyframe that falls into the other's image: below, what is left
-/// in common is a rim.
+/// Smallest share of each keyframe's points that falls into the other's image: below, they have only a margin in
+/// common.
 const MIN_SHARED: f64 = 0.3;
 /// Most keyframes that are compared with earlier ones, spread evenly over the map: 240 pairs, a second.
 const MAX_JUDGED: usize = 60;
-/// Most earlier keyframes that are looked at for each, spread evenly.
+/// Most earlier keyframes that are considered for each, spread evenly.
 const MAX_EARLIER: usize = 64;
-/// Points that tell how much two keyframes share: to a few percent.
+/// Points that estimate the overlap of two keyframes: to a few percent.
 const OVERLAP_POINTS: usize = 200;
-/// Nearer than this share of its depth in the other keyframe a point is not compared: it is magnified
-/// beyond recognition.
+/// A point nearer than this share of its original depth is not compared: it is magnified beyond recognition.
 const NEAREST_DEPTH_RATIO: f64 = 0.1;
 
 /// The similarity between two keyframes, for projecting points of one into the other.
@@ -26,25 +25,25 @@ pub struct SharedView<'a> {
     into_from_from: Sim3,
 }
 
-/// Where a point falls.
+/// A projected point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Projection {
     /// Column, pixels.
     pub u: f64,
     /// Row, pixels.
     pub v: f64,
-    /// Inverse depth there, 1/units of that keyframe.
+    /// Inverse depth in the other keyframe, 1/units of that keyframe.
     pub inverse_depth: f64,
 }
 
 impl<'a> SharedView<'a> {
-    /// By the final poses and scales of both.
+    /// From the final poses and scales of both.
     pub fn new(from: &'a Keyframe, into: &'a Keyframe) -> Self {
         let into_from_from = into.map_from_keyframe.inverse() * from.map_from_keyframe;
         Self { from, into, into_from_from }
     }
 
-    /// Where pixel (u, v) with this inverse depth falls; `None` outside the image.
+    /// Projects pixel (u, v) with this inverse depth; `None` outside the image.
     pub fn project(&self, u: f64, v: f64, inverse_depth: f64) -> Option<Projection> {
         let (a, b) = (&self.from.intrinsics, &self.into.intrinsics);
         let depth = 1.0 / inverse_depth;
@@ -63,7 +62,7 @@ impl<'a> SharedView<'a> {
         })
     }
 
-    /// About `count` points, spread over the keyframe, with where they fall.
+    /// About `count` points, spread over the keyframe, with their projections.
     pub fn projections(
         &self,
         count: usize,
@@ -90,16 +89,16 @@ impl<'a> SharedView<'a> {
 /// Two keyframes of one epoch that share a view, the earlier first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pair {
-    /// Place of the earlier in the map.
+    /// Index of the earlier in the map.
     pub earlier: usize,
-    /// Place of the later in the map.
+    /// Index of the later in the map.
     pub later: usize,
-    /// Whether others of the epoch were made between them.
+    /// Whether others of the epoch were created between them.
     pub is_wide: bool,
 }
 
-/// Pairs of keyframes that share a view: each later one with the oldest, the newest and two between of
-/// the earlier ones that see the same place. At most four for each of sixty keyframes.
+/// Pairs of keyframes that share a view: each later one with the oldest, the newest and two in between of the earlier
+/// ones that see the same place. At most four for each of sixty keyframes.
 pub fn pairs(keyframes: &[Keyframe]) -> Vec<Pair> {
     let judged = |k: &Keyframe| {
         let has_image = k.image.len() == k.intrinsics.width * k.intrinsics.height;
@@ -125,7 +124,7 @@ pub fn pairs(keyframes: &[Keyframe]) -> Vec<Pair> {
     pairs
 }
 
-/// At most `most` of the numbers below `count`, spread evenly, the first and the last among them.
+/// At most `most` of the numbers below `count`, evenly spread, including the first and the last.
 fn spread(count: usize, most: usize) -> impl Iterator<Item = usize> {
     let taken = count.min(most);
     (0..taken).map(move |i| if taken < 2 { count - 1 } else { i * (count - 1) / (taken - 1) })

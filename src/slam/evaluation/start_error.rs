@@ -1,4 +1,4 @@
-//! How wrong a start from two frames is: its motion and its depth against the truth.
+//! Errors of a start from two frames: its motion and its depth against the truth.
 
 use crate::slam::evaluation::depth_error::{DepthErrors, DepthScale, DepthStatistics};
 use crate::slam::evaluation::depth_modes::DepthModes;
@@ -9,16 +9,16 @@ use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
 use crate::slam::two_frame::InitialDepth;
 
-/// A start whose direction is further off than this is wrong, degrees: half of it would be noise of a short
-/// baseline, a wrong minimum is further off.
+/// Direction error above which a start is wrong, degrees: half of it may be noise of a short baseline, a wrong minimum
+/// is further off.
 pub const WRONG_DIRECTION_DEG: f64 = 30.0;
-/// A start whose depths are further off than this in the median is wrong.
+/// Median relative depth error above which a start is wrong.
 pub const WRONG_DEPTH: f64 = 0.15;
-/// A start whose tilt and relief together move its depths by more than this, as a standard deviation of the relative
-/// error, is wrong: poses absorb it, and the frames that follow take it for the shape of the scene.
+/// Standard deviation of the relative depth error from tilt and relief together above which a start is wrong: poses
+/// absorb it, and the frames that follow take it for the shape of the scene.
 pub const WRONG_SHAPE: f64 = 0.15;
 
-/// What a start has wrong.
+/// The errors of a start.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StartErrors {
     /// Angle between the translation and the true one, degrees.
@@ -27,17 +27,17 @@ pub struct StartErrors {
     pub rotation_deg: f64,
     /// Length of the true translation, metres.
     pub baseline_m: f64,
-    /// The errors of its depths; `None` where the first frame's true depth is not known.
+    /// The errors of its depths; `None` where the first frame's true depth is unknown.
     pub depth: Option<DepthStatistics>,
-    /// Tilt and relief of its depths; `None` also where too few points tell them apart.
+    /// Tilt and relief of its depths; `None` also where too few points distinguish them.
     pub modes: Option<DepthModes>,
-    /// Relative error that they make together, see [`DepthModes::spread`].
+    /// Relative error that they cause together, see [`DepthModes::spread`].
     pub shape: Option<f64>,
 }
 
 impl StartErrors {
-    /// Of a start that found `first_from_current` where `truth` is right, and the `depths` of the first frame, whose
-    /// `true_depth` is in metres and 0 where unknown.
+    /// Errors of a start that found `first_from_current` where `truth` is right, and the `depths` of the first frame,
+    /// whose `true_depth` is in metres and 0 where unknown.
     pub fn of(
         first_from_current: &SE3,
         depths: impl Iterator<Item = InitialDepth>,
@@ -71,7 +71,7 @@ impl StartErrors {
         }
     }
 
-    /// Whether it is no start to build on.
+    /// Whether the start is too wrong to build on.
     pub fn is_wrong(&self) -> bool {
         let depth = self.depth.is_some_and(|depth| depth.relative_error_median > WRONG_DEPTH);
         let shape = self.shape.is_some_and(|shape| shape > WRONG_SHAPE);
@@ -85,7 +85,7 @@ mod tests {
 
     const CAMERA: Intrinsics = Intrinsics::pinhole(64, 48, 60.0);
 
-    /// The errors of a start that is right but for its direction and for depths whose logarithm is stretched.
+    /// The errors of a start that is right except for its direction and for depths whose logarithm is stretched.
     fn errors(direction_deg: f64, relief: f64, noise: f64) -> StartErrors {
         let (sine, cosine) = direction_deg.to_radians().sin_cos();
         let at = |x: f64, y: f64| SE3 { translation: [x, y, 0.0].into(), ..SE3::identity() };
@@ -119,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn a_start_without_motion_or_truth_is_judged_by_what_there_is() {
+    fn a_start_without_motion_or_truth_is_judged_by_the_errors_that_exist() {
         let none = std::iter::empty();
         let moved = SE3 { translation: [0.1, 0.0, 0.0].into(), ..SE3::identity() };
         let found = StartErrors::of(&moved, none.clone(), &CAMERA, &moved, None);

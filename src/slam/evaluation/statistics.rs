@@ -16,7 +16,7 @@ pub struct ErrorStatistics {
 }
 
 impl ErrorStatistics {
-    /// Statistics of `errors`; `None` of no errors, or where a sum is not finite.
+    /// Statistics of `errors`; `None` for no errors, or where a sum is not finite.
     pub fn of(errors: &[f64]) -> Option<Self> {
         let count = errors.len() as f64;
         let mean = errors.iter().sum::<f64>() / count;
@@ -31,7 +31,7 @@ impl ErrorStatistics {
     }
 }
 
-/// The median, the mean of the middle two of an even number; `None` of nothing.
+/// The median, the mean of the middle two of an even number; `None` for no values.
 pub fn median(values: &[f64]) -> Option<f64> {
     if values.is_empty() {
         return None;
@@ -45,8 +45,8 @@ pub fn median(values: &[f64]) -> Option<f64> {
     Some(if even { lower.map_or(upper, |lower| 0.5 * (lower + upper)) } else { upper })
 }
 
-/// The smallest value that at least `share` (0 to 1) of the values do not exceed (nearest rank);
-/// `None` of nothing. `sorted` is in ascending order.
+/// The smallest value that at least `share` (0 to 1) of the values do not exceed (nearest rank); `None` for no values.
+/// `sorted` is in ascending order.
 pub fn percentile(sorted: &[f64], share: f64) -> Option<f64> {
     let rank = (share.clamp(0.0, 1.0) * sorted.len() as f64).ceil() as usize;
     sorted.get(rank.max(1) - 1).copied()
@@ -66,7 +66,7 @@ pub fn percentiles<const N: usize>(
     Some(found)
 }
 
-/// Largest over smallest of positive values; `None` below two.
+/// Ratio of the largest to the smallest of positive values; `None` for fewer than two.
 pub fn largest_over_smallest(values: impl Iterator<Item = f64> + Clone) -> Option<f64> {
     let largest = values.clone().fold(0.0, f64::max);
     let smallest = values.clone().fold(f64::INFINITY, f64::min);
@@ -78,7 +78,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn median_of_odd_even_one_and_none() {
+    fn median_of_odd_even_one_and_no_values() {
         assert_eq!(median(&[3.0, 1.0, 2.0]), Some(2.0));
         assert_eq!(median(&[4.0, 1.0, 3.0, 2.0]), Some(2.5));
         assert_eq!(median(&[7.0]), Some(7.0));

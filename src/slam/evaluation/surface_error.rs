@@ -1,4 +1,4 @@
-//! How far points of a map are from the true surface, where true depth is known.
+//! Distance of a map's points from the true surface, where true depth is known.
 
 use std::collections::HashMap;
 
@@ -9,17 +9,17 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 
-/// Distance of the points of the true surface, metres: walls are exact in between, as each has a normal.
+/// Distance between the points of the true surface, metres: walls are exact in between, as each has a normal.
 const SPACING: f64 = 0.015;
-/// Pixels of true depth that are looked at, along each axis one of so many: about [`SPACING`] apart in a room.
+/// Pixel step through the true depth along each axis: about [`SPACING`] in a room.
 const STRIDE: usize = 2;
-/// Farthest that a point is looked for, metres; beyond, its distance is at least that.
+/// Search radius around a point, metres; beyond, its distance counts as this.
 pub const REACH: f64 = 0.15;
-/// Error of a point that is off, as a share of its distance.
+/// Error above which a point is off, as a share of its distance.
 const OFF_RATIO: f64 = 0.03;
-/// Error of a point that is right.
+/// Error up to which a point is right, as a share of its distance.
 const RIGHT_RATIO: f64 = 0.01;
-/// Distance within which a point shows the same as another.
+/// Distance within which a point shows the same as another, as a share of its distance.
 const SHOWN_RATIO: f64 = 0.02;
 /// Largest difference of neighbouring depths on one surface, as a share.
 const STEP: f64 = 0.02;
@@ -33,21 +33,21 @@ pub struct TrueSurface {
     near: HashMap<[i32; 3], Vec<[i32; 3]>>,
 }
 
-/// How far points are from the true surface.
+/// Distances of points from the true surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SurfaceErrors {
     /// Median distance, metres.
     pub median_m: f64,
     /// Median distance, as a share of the distance from the camera that saw the point.
     pub median_ratio: f64,
-    /// Share of the points that are off by more than 3 % of that, 0 to 1.
+    /// Share of the points that are off by more than 3 % of that distance, 0 to 1.
     pub off: f64,
 }
 
-/// A point that a camera saw.
+/// A point seen by a camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SeenPoint {
-    /// Where it is, metres.
+    /// Position, metres.
     pub position: Vector3<f64>,
     /// Distance from the camera, metres.
     pub distance: f64,
@@ -57,7 +57,7 @@ fn cell(at: &Vector3<f64>, side: f64) -> [i32; 3] {
     [at.x, at.y, at.z].map(|c| (c / side).floor() as i32)
 }
 
-/// The nearer of a point with its normal and of what was nearest so far: distance to the point, and to the surface there.
+/// The nearer of a point with its normal and the nearest so far: distance to the point, and to the surface there.
 fn nearer(
     at: &Vector3<f64>,
     (point, normal): &(Vector3<f64>, Vector3<f64>),
@@ -69,13 +69,13 @@ fn nearer(
         return nearest;
     }
     let off = normal.dot(&offset);
-    // Beside the surface the plane is not it.
+    // Off the edge of the surface, its plane does not count.
     let is_beside = (offset - normal * off).norm() > 2.0 * SPACING;
     (distance, if is_beside { distance } else { off.abs() })
 }
 
 impl TrueSurface {
-    /// Adds what a true depth image shows (metres, 0 where there is none).
+    /// Adds the surface of a true depth image (metres, 0 where unknown).
     pub fn add(&mut self, depth: &Image<f32>, k: &Intrinsics, world_from_camera: &SE3) {
         let at = |u: usize, v: usize| {
             let z = f64::from(depth.at(u, v));
@@ -99,15 +99,15 @@ impl TrueSurface {
         }
     }
 
-    /// Its points, in no order.
+    /// Its points, in no particular order.
     pub fn points(&self) -> impl Iterator<Item = &Vector3<f64>> {
         self.points.values().map(|(point, _)| point)
     }
 
-    /// Distance of a point, metres: to the plane of the nearest point of the surface, [`REACH`] where there is none.
+    /// Distance of a point, metres: to the plane of the nearest surface point, [`REACH`] where there is none.
     pub fn distance(&self, at: &Vector3<f64>) -> f64 {
         let mut nearest = (REACH, REACH);
-        // Most points are on it.
+        // Most points lie on the surface.
         around(cell(at, SPACING)).filter_map(|key| self.points.get(&key)).for_each(|point| {
             nearest = nearer(at, point, nearest);
         });
@@ -118,7 +118,7 @@ impl TrueSurface {
         nearest.1
     }
 
-    /// Errors of points; `None` of none.
+    /// Errors of points; `None` for no points.
     pub fn errors(&self, points: &[SeenPoint]) -> Option<SurfaceErrors> {
         let errors: Vec<f64> = points.iter().map(|point| self.distance(&point.position)).collect();
         let ratio = |(error, point): (&f64, &SeenPoint)| error / point.distance;
@@ -131,8 +131,8 @@ impl TrueSurface {
         })
     }
 
-    /// Of those of `all` points that are right the share that has a point of `few` near it, 0 to 1: what few points still
-    /// show of what all of them show.
+    /// Of those of `all` points that are right, the share with a point of `few` near it, 0 to 1: how much of what all
+    /// points show the few still show.
     pub fn shown(&self, all: &[SeenPoint], few: &[SeenPoint]) -> f64 {
         let mut cells: HashMap<[i32; 3], Vec<&Vector3<f64>>> = HashMap::new();
         for point in few {
@@ -152,7 +152,7 @@ impl TrueSurface {
     }
 }
 
-/// A cell and those that touch it.
+/// A cell and its 26 neighbours.
 fn around([x, y, z]: [i32; 3]) -> impl Iterator<Item = [i32; 3]> {
     (0..27).map(move |i| [x + i / 9 - 1, y + i / 3 % 3 - 1, z + i % 3 - 1])
 }
@@ -186,13 +186,13 @@ mod tests {
             let found = wall.distance(&seen(x, z).position);
             assert!((found - distance).abs() < 1e-6, "{x} {z}: {found}");
         }
-        // Beside its edge, which is at x = 1.32.
+        // Off its edge, which is at x = 1.32.
         let beside = wall.distance(&Vector3::new(1.42, 0.1, 2.0));
         assert!((beside - 0.1).abs() < 0.03, "{beside}");
     }
 
     #[test]
-    fn errors_and_what_few_points_show() {
+    fn errors_and_the_share_that_few_points_show() {
         let wall = wall();
         let all: Vec<SeenPoint> = (0..100).map(|i| seen(0.01 * f64::from(i), 2.0)).collect();
         let off: Vec<SeenPoint> =
@@ -204,7 +204,7 @@ mod tests {
         );
         assert_eq!(wall.errors(&[]), None);
         let half: Vec<SeenPoint> = all.iter().filter(|p| p.position.x < 0.495).copied().collect();
-        // 2 % of 2 m beyond the last of them are shown too.
+        // The 2 % of 2 m beyond the last of them are shown too.
         let shown = wall.shown(&all, &half);
         assert!((shown - 0.54).abs() < 0.011, "{shown}");
         assert_eq!(wall.shown(&[], &half), 0.0);

@@ -8,14 +8,14 @@ use crate::slam::trajectory::StampedPose;
 /// Errors of the motion between pairs of poses.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct RelativeErrors {
-    /// Length of the translation error, one for each pair, unit of the ground truth.
+    /// Length of the translation error, one per pair, unit of the ground truth.
     pub translation: Vec<f64>,
-    /// Angle of the rotation error, one for each pair, degrees.
+    /// Angle of the rotation error, one per pair, degrees.
     pub rotation_deg: Vec<f64>,
 }
 
 impl RelativeErrors {
-    /// Adds those of other pairs.
+    /// Adds the errors of other pairs.
     pub fn append(&mut self, other: &Self) {
         self.translation.extend(&other.translation);
         self.rotation_deg.extend(&other.rotation_deg);
@@ -35,8 +35,7 @@ pub fn absolute_errors(
     estimate.iter().zip(truth).map(error).collect()
 }
 
-/// Pairs (i, j) with j the pose nearest to `interval_nanos` after i, where it is at most
-/// `max_difference_nanos` off.
+/// Pairs (i, j), j the pose nearest to `interval_nanos` after i, if it is at most `max_difference_nanos` off.
 pub fn timed_pairs(
     poses: &[StampedPose],
     interval_nanos: i64,

@@ -1,4 +1,4 @@
-//! The similarity that brings one set of points nearest to another (Umeyama 1991).
+//! The similarity that best aligns one set of points with another (Umeyama 1991).
 
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
@@ -7,7 +7,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::trajectory::StampedPose;
 
-/// What may be fitted before positions are compared.
+/// The transformation fitted before positions are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum TrajectoryAlignment {
@@ -16,12 +16,12 @@ pub enum TrajectoryAlignment {
     Sim3,
     /// Rotation and translation: where the estimate is in metres.
     SE3,
-    /// Nothing: both are in the same frame already.
+    /// Nothing: both are in the same coordinate frame already.
     None,
 }
 
 impl TrajectoryAlignment {
-    /// Matches below which the alignment is not fixed.
+    /// Fewest matches that determine the alignment.
     pub fn poses_needed(self) -> usize {
         match self {
             Self::Sim3 | Self::SE3 => 3,
@@ -33,10 +33,10 @@ impl TrajectoryAlignment {
 /// Why two sets of positions cannot be aligned.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum AlignmentError {
-    /// All positions of one are the same, so it has no scale.
+    /// All positions of one trajectory are the same, so its scale is undefined.
     #[error("the {0} stands still, so no scale can be found: align with se3 or none")]
     StandsStill(&'static str),
-    /// The best scale is not positive: one is no image of the other.
+    /// The best scale is not positive: one is not a similar copy of the other.
     #[error("no positive scale brings the estimate to the ground truth: align with se3 or none")]
     NoScale,
     /// The positions are so large that their products are not finite.
@@ -44,8 +44,8 @@ pub enum AlignmentError {
     NotFinite,
 }
 
-/// Positions that differ by less than this share of their size are one and the same: the rounding
-/// of a file with nine digits.
+/// Positions that differ by less than this share of their magnitude are the same: the rounding of a file with nine
+/// digits.
 const STILL_RATIO: f64 = 1e-9;
 
 /// `truth_from_estimate` by least squares on the positions of matched poses: with means μ and the
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mirrored_copy_is_not_met_by_a_reflection() {
+    fn a_mirrored_copy_is_not_aligned_by_a_reflection() {
         let x = poses(&[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]]);
         let y = poses(&[[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]]);
         let fit = umeyama(&x, &y, TrajectoryAlignment::Sim3).unwrap();
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn positions_on_a_line_are_met_exactly() {
+    fn positions_on_a_line_are_aligned_exactly() {
         let x = poses(&[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]]);
         let y = poses(&[[5.0, 0.0, 0.0], [5.0, 2.0, 0.0], [5.0, 6.0, 0.0]]);
         let fit = umeyama(&x, &y, TrajectoryAlignment::Sim3).unwrap();
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn standing_still_has_no_scale_but_a_place() {
+    fn a_stationary_trajectory_has_a_position_but_no_scale() {
         let x = poses(&[[1e6, 0.0, 0.0], [1e6, 0.0, 0.0], [1e6, 0.0, 0.0]]);
         let y = poses(&[[0.0, 1.0, 0.0], [0.0, 2.0, 0.0], [0.0, 3.0, 0.0]]);
         assert_eq!(

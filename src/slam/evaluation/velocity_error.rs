@@ -1,9 +1,9 @@
-//! Velocity errors against the covariance that was reported: normalised estimation errors squared, as of poses.
+//! Velocity errors against the reported covariance: normalised estimation errors squared, as for poses.
 //!
-//! The true velocity at a frame's stamp is the mean of those over the interval before it and over one as long after it, each
-//! log(T₀⁻¹ T₁)/Δt of true poses in the camera's axes: that over the interval before alone, which is what is estimated, would
-//! not show what the camera accelerates by until the stamp. Its linear part is divided by the length of a world unit, one for each keyframe: a
-//! velocity does not hold the error of the scale, as a pose on a keyframe does not.
+//! The true velocity at a frame's stamp is the mean of those over the interval before it and over an equally long one
+//! after it, each log(T₀⁻¹ T₁)/Δt of true poses in the camera's axes: the interval before alone, which is what is
+//! estimated, would hide the acceleration up to the stamp. Its linear part is divided by the length of a world unit,
+//! one per keyframe: a velocity does not contain the error of the scale, just as a pose on a keyframe does not.
 
 use std::collections::BTreeMap;
 
@@ -17,8 +17,9 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::pose::PoseEstimate;
 use crate::slam::trajectory::StampedPose;
 
-/// Normalised errors of the velocities of `estimates` (tracked frames of one epoch, in order), whose keyframes are given as
-/// (id, stamp), against `truth`; keyframes with fewer than five frames are left out. `None` where nothing can be compared.
+/// Normalised errors of the velocities of `estimates` (tracked frames of one epoch, in order), whose keyframes are
+/// given as (id, stamp), against `truth`; keyframes with fewer than five frames are left out. `None` where nothing can
+/// be compared.
 pub fn velocity_normalized_errors(
     estimates: &[&PoseEstimate],
     keyframes: &[(u64, i64)],
@@ -45,13 +46,13 @@ pub fn velocity_normalized_errors(
     NormalizedErrors::of(&estimates.windows(2).filter_map(error).collect::<Vec<_>>())
 }
 
-/// Units and radians a second; `None` of one instant.
+/// Units and radians per second; `None` for equal stamps.
 fn true_velocity(before: &StampedPose, now: &StampedPose) -> Option<Vector6<f64>> {
     let nanos = now.nanos.checked_sub(before.nanos).filter(|&nanos| nanos > 0)?;
     Some((before.world_from_camera.inverse() * now.world_from_camera).log() / (nanos as f64 * 1e-9))
 }
 
-/// Length of a world unit in the truth's, on each keyframe: that of a keyframe unit over the world units that it has.
+/// Length of a world unit in the truth's, on each keyframe: that of a keyframe unit over its number of world units.
 fn world_units(
     estimates: &[&PoseEstimate],
     keyframes: &[(u64, i64)],
@@ -80,8 +81,8 @@ fn world_units(
     keyframes.iter().filter_map(unit).collect()
 }
 
-/// World units of a unit of a keyframe, from what the camera moved `steps` on it: within a visit. Between two visits the
-/// world may have drifted.
+/// World units per keyframe unit, from the camera's motion in `steps` on that keyframe: within a visit. Between two
+/// visits the world may have drifted.
 fn world_units_of(steps: &[[&PoseEstimate; 2]]) -> Option<f64> {
     let length = |of: fn(&PoseEstimate) -> &SE3| {
         let moved =
@@ -127,7 +128,7 @@ mod tests {
         triangle
     }
 
-    /// Two hundred frames on each of two keyframes, in a world that lies elsewhere.
+    /// Two hundred frames on each of two keyframes, in a world placed elsewhere.
     fn run(noise: &mut Noise) -> Vec<PoseEstimate> {
         let twist = Vector6::new(4.0, -2.0, 1.0, 0.5, -1.0, 0.3);
         let world_from_truth = Sim3::new(SE3::exp(&twist), 1.0 / WORLD_M);
@@ -164,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn a_keyframe_that_the_camera_comes_back_to_after_a_drift_has_one_unit() {
+    fn a_keyframe_revisited_after_drift_has_one_unit() {
         let mut estimates = run(&mut Noise(3));
         let to_first = exact(0).inverse() * exact(FRAMES / 2);
         for estimate in estimates.iter_mut().filter(|estimate| estimate.sequence >= FRAMES * 3 / 4)
@@ -186,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_of_the_size_that_was_said_are_six_in_the_mean_whatever_the_units() {
+    fn errors_of_the_reported_size_have_a_mean_of_six_whatever_the_units() {
         let mut estimates = run(&mut Noise(3));
         let truth: Vec<_> = (0..FRAMES)
             .map(|frame| StampedPose { nanos: nanos(frame), world_from_camera: exact(frame) })
@@ -197,7 +198,7 @@ mod tests {
             velocity_normalized_errors(&estimates, &keyframes, truth, 1_000_000)
         };
         let errors = measure(&estimates, &truth).unwrap();
-        // The first has no velocity, the last no truth behind it.
+        // The first frame has no velocity, the last has no truth after it.
         assert_eq!(errors.frames, FRAMES as usize - 2);
         assert!((errors.mean - 6.0).abs() < 0.6, "{errors:?}");
         assert!((errors.translation - 3.0).abs() < 0.4, "{errors:?}");

@@ -1,26 +1,26 @@
-//! How the estimate does over short stretches: its scale as it wanders, its shape.
+//! Short stretches of an estimate: the drift of its scale, and its shape.
 
 use crate::slam::evaluation::trajectory_error::absolute_errors;
 use crate::slam::evaluation::umeyama::{TrajectoryAlignment, umeyama};
 use crate::slam::trajectory::StampedPose;
 
-/// Matches of a window whose scale is measured: 3 s at 30 Hz, long enough for a walk to fix it.
+/// Matches per window for the scale: 3 s at 30 Hz, long enough for a walk to determine it.
 pub const SCALE_WINDOW: usize = 100;
 
-/// Matches of a window whose shape is measured: 1 s at 30 Hz, too short for drift to show.
+/// Matches per window for the shape: 1 s at 30 Hz, too short for drift to show.
 pub const SHAPE_WINDOW: usize = 30;
 
-/// First matches of consecutive windows of `length` among `count` matches. Where they leave a rest one more ends
-/// at the last match, so that the end of a run counts: it has matches in common with the one before, as a shorter
-/// one would say less.
+/// First matches of consecutive windows of `length` among `count` matches. Where a remainder is left, one more window
+/// ends at the last match, so that the end of a run counts: it overlaps the one before, as a shorter one would tell
+/// less.
 fn starts(count: usize, length: usize) -> impl Iterator<Item = usize> {
     let whole = (0..count / length).map(move |i| i * length);
     let has_rest = count > length && !count.is_multiple_of(length);
     whole.chain(has_rest.then(|| count - length))
 }
 
-/// Index of the first match and Sim(3) scale of windows of [`SCALE_WINDOW`] matches up to the last one; windows that
-/// stand still have no scale and are left out.
+/// Index of the first match and Sim(3) scale of windows of [`SCALE_WINDOW`] matches up to the last one; stationary
+/// windows have no scale and are left out.
 pub fn scale_windows(estimate: &[StampedPose], truth: &[StampedPose]) -> Vec<(usize, f64)> {
     let scale = |first: usize| {
         let window = first..first + SCALE_WINDOW;
@@ -30,7 +30,7 @@ pub fn scale_windows(estimate: &[StampedPose], truth: &[StampedPose]) -> Vec<(us
     starts(estimate.len(), SCALE_WINDOW).filter_map(scale).collect()
 }
 
-/// Position errors in windows of [`SHAPE_WINDOW`] matches up to the last one, each window aligned by itself and each
+/// Position errors in windows of [`SHAPE_WINDOW`] matches up to the last one, each window aligned separately and each
 /// match counted once; windows that cannot be aligned are left out.
 pub fn shape_errors(
     estimate: &[StampedPose],
@@ -75,11 +75,11 @@ mod tests {
     }
 
     #[test]
-    fn the_end_of_a_run_that_fills_no_window_counts() {
+    fn the_end_of_a_run_counts_even_if_it_fills_no_window() {
         assert_eq!(starts(250, 100).collect::<Vec<_>>(), [0, 100, 150]);
         assert_eq!(starts(200, 100).collect::<Vec<_>>(), [0, 100]);
         assert_eq!(starts(99, 100).count(), 0);
-        // The scale doubles in the last 50 of 250 matches: whole windows alone say 1.
+        // The scale doubles in the last 50 of 250 matches: the ratio of whole windows alone is 1.
         let (estimate, truth) = walk(250, |i| if i < 200 { 1.0 } else { 2.0 });
         let ratio = ratio_of(&scale_windows(&estimate, &truth)).unwrap();
         assert!(ratio > 1.2, "{ratio}");

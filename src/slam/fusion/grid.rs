@@ -1,19 +1,19 @@
-//! Points in a grid of cells, to look for those near a place.
+//! Points in a grid of cells, for queries of those near a position.
 
-/// Points hashed by cell: lists in the order in which points were put in, the last first.
+/// Points hashed by cell: lists in reverse order of insertion.
 #[derive(Debug)]
 pub(super) struct Grid {
     side: f64,
     mask: usize,
     heads: Vec<u32>,
-    /// Each point with the one before it in its bucket.
+    /// Each point with the index of the previous one in its bucket.
     points: Vec<([f32; 3], u32)>,
 }
 
 const NONE: u32 = u32::MAX;
 
 impl Grid {
-    /// An empty one with cells of `side`, for about `count` points.
+    /// An empty grid with cells of `side`, for about `count` points.
     pub fn new(side: f64, count: usize) -> Self {
         let buckets = (2 * count).next_power_of_two().max(16);
         Self {
@@ -24,7 +24,7 @@ impl Grid {
         }
     }
 
-    /// Puts in the next point; its number is how many came before.
+    /// Adds the next point; points are numbered from 0 in order of insertion.
     pub fn push(&mut self, position: [f32; 3]) {
         let bucket = self.bucket(self.cell(position));
         self.points.push((position, self.heads[bucket]));
@@ -71,7 +71,7 @@ pub(super) fn hash([x, y, z]: [i64; 3]) -> u64 {
     mixed ^ (mixed >> 32)
 }
 
-/// The largest whole number that is not above `x`; `f64::floor` is a call on CPUs of the least instruction set.
+/// The largest integer not above `x`; `f64::floor` is a call on CPUs of the least instruction set.
 fn floor(x: f64) -> i64 {
     let whole = x as i64;
     whole - i64::from(whole as f64 > x)
@@ -86,7 +86,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn points_near_a_place_are_those_of_a_search_through_all() {
+    fn points_near_a_position_are_those_of_an_exhaustive_search() {
         let number = |i: u64, c: i64| (hash([i as i64, c, 7]) % 2000) as f32 / 1000.0 - 1.0;
         let points: Vec<[f32; 3]> =
             (0..500).map(|i| [number(i, 0), number(i, 1), number(i, 2)]).collect();

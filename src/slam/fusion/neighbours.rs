@@ -1,21 +1,21 @@
-//! Which keyframes see the same place, without looking at every pair.
+//! Finds the keyframes that see the same part of the scene, without considering every pair.
 
 use std::collections::BTreeMap;
 
 use crate::slam::fusion::view::View;
 
-/// Points of a keyframe by which its place is known.
+/// Points of a keyframe that represent its view.
 const SAMPLES: usize = 64;
-/// Side of a cell of space, in mean distances of the map's points from their keyframes: what a keyframe sees fills a
-/// dozen or so.
+/// Side of a cell of space, in mean distances of the map's points from their keyframes: a keyframe's view fills a dozen
+/// or so.
 const CELL_RATIO: f64 = 0.5;
 /// Keyframes of a cell that are compared: a camera that stands still for hours fills a cell with thousands.
 const MAX_IN_CELL: usize = 64;
-/// Least share of a keyframe's samples in cells that another has samples in.
+/// Least share of the cells of a keyframe's samples in which another has samples too.
 const MIN_SHARED: f64 = 0.15;
 
-/// For each view at most `most` others that see the same place: half of them those that share most, and half spread over
-/// the run, as keyframes that follow each other share the errors of their depth.
+/// For each view at most `most` others that see the same part of the scene: half of them those that share most, and
+/// half spread over the run, as consecutive keyframes share the errors of their depth.
 pub(super) fn neighbours(views: &[View<'_>], most: usize) -> Vec<Vec<usize>> {
     let samples: Vec<Vec<[f64; 3]>> = views.iter().map(samples_of).collect();
     let distances = views.iter().zip(&samples).flat_map(|(view, samples)| {
@@ -33,7 +33,7 @@ pub(super) fn neighbours(views: &[View<'_>], most: usize) -> Vec<Vec<usize>> {
     (0..views.len()).map(|i| chosen(i, &cells[i], &of_cell, most)).collect()
 }
 
-/// Where some points of a view are, map units.
+/// Positions of some points of a view, map units.
 fn samples_of(view: &View<'_>) -> Vec<[f64; 3]> {
     /// Steps of this share of a list spread over it whatever the width of the image.
     const GOLDEN_RATIO: f64 = 0.618_033_988_749_895;

@@ -5,24 +5,24 @@ use nalgebra::{Matrix3, Vector3};
 use crate::slam::fusion::view::View;
 use crate::slam::keyframe::DepthPoint;
 
-/// Pixels to each side that are looked at: depth with holes has some thirty there.
+/// Pixels considered to each side: depth with holes has some thirty there.
 const RADIUS: usize = 6;
-/// Fewest pixels with depth of one surface.
+/// Fewest pixels with depth on one surface.
 const FEWEST: usize = 12;
-/// Depths farther apart than so many standard deviations are not of one surface.
+/// Depths more than this many standard deviations apart are not on one surface.
 const TOLERANCE: f64 = 3.0;
-/// Share of the inverse depth by which depths of one surface differ where they are known exactly: a surface seen at 75°
-/// over [`RADIUS`] pixels at f = 500.
+/// Share of the inverse depth by which exact depths of one surface differ: a surface seen at 75° over [`RADIUS`] pixels
+/// at f = 500.
 const FLOOR: f64 = 0.05;
-/// Depth is smoothed over its neighbours: differences between these vary by so much less than their variances say.
+/// Depth is smoothed over its neighbours: differences between these vary by this much less than their variances.
 const CORRELATED: f64 = 9.0;
-/// Largest standard deviation of a normal's direction, radians (17°): one that is known worse lights a surface wrongly.
+/// Largest standard deviation of a normal's direction, radians (17°): a less certain one shades a surface wrongly.
 const MAX_STD_DEV: f64 = 0.3;
-/// Smallest sine of the angle between the ray and the surface: flatter, a surface is not seen.
+/// Smallest sine of the angle between ray and surface: a surface at a shallower angle is not seen.
 const LEAST_SINE: f64 = 0.1;
 
-/// The normal at a point of a keyframe, in the keyframe's axes, towards the camera; `None` where the depth around does not
-/// tell. An inverse depth that is a plane over the image, d = n · ray, is a plane in space with normal n.
+/// The normal at a point of a keyframe, in the keyframe's axes, towards the camera; `None` where the depth around does
+/// not determine it. An inverse depth that is a plane over the image, d = n · ray, is a plane in space with normal n.
 pub(super) fn normal(view: &View<'_>, point: &DepthPoint) -> Option<Vector3<f64>> {
     let d = f64::from(point.inverse_depth);
     let bound = |other: &DepthPoint| {
@@ -50,7 +50,7 @@ pub(super) fn normal(view: &View<'_>, point: &DepthPoint) -> Option<Vector3<f64>
     }
     let inverse = normal.cholesky()?.inverse();
     let plane = inverse * right;
-    // Of the depths about the plane, or as they claim, whichever is more.
+    // The scatter of the depths about the plane or their own variances, whichever is larger.
     let residual = (sum_of_squares - right.dot(&plane)) / (count - 3) as f64;
     let variance = residual.max(sum / count as f64 / CORRELATED);
     // d = n · ray with ray = centre + offset.

@@ -1,4 +1,4 @@
-//! Points in an order of which any beginning shows all of the map, coarser the shorter it is.
+//! Orders points so that any prefix shows the whole map, more coarsely the shorter it is.
 
 use crate::slam::fusion::SurfacePoint;
 use crate::slam::fusion::grid::hash;
@@ -6,12 +6,12 @@ use crate::slam::fusion::grid::hash;
 /// Bits of a coordinate.
 const BITS: u32 = 20;
 
-/// Levels by which a point that one or two keyframes have comes later: it may be wrong, and where it is alone in a large
-/// cell it would be among the first.
+/// Levels by which a point from only one or two keyframes is deferred: it may be wrong, and where it is alone in a
+/// large cell it would be among the first.
 const DOUBT: u32 = 3;
 
-/// The order: place in the list for each rank. In each cell of an octree the best known point stands for it; points that
-/// stand for larger cells come first, those of one size in no order of place.
+/// The order: index in the list for each rank. The most certain point of each octree cell represents it; points that
+/// represent larger cells come first, those of one size in random spatial order.
 pub(super) fn progressive_order(points: &[SurfacePoint]) -> Vec<usize> {
     let positions = || points.iter().map(|point| point.position);
     let [low, high] =
@@ -43,7 +43,7 @@ pub(super) fn progressive_order(points: &[SurfacePoint]) -> Vec<usize> {
     ranked.into_iter().map(|(_, _, i)| i).collect()
 }
 
-/// For each point, in order of the codes, the level of the largest cell that it stands for, from 0.
+/// For each point, in order of the codes, the level of the largest cell that it represents, from 0.
 fn levels(points: &[SurfacePoint], by_code: &[(u64, usize)]) -> Vec<u32> {
     const NONE: u32 = u32::MAX;
     let mut levels = vec![NONE; by_code.len()];
@@ -65,11 +65,11 @@ fn levels(points: &[SurfacePoint], by_code: &[(u64, usize)]) -> Vec<u32> {
             }
         }
     }
-    // Those that share the smallest cell with a better one.
+    // The points that share the smallest cell with a better one.
     levels.into_iter().map(|level| level.min(BITS + 1)).collect()
 }
 
-/// A number with two zeros between its bits.
+/// A number with two zero bits inserted between its bits.
 fn spread(number: u64) -> u64 {
     let mut x = number & 0x1F_FFFF;
     for (shift, mask) in [
@@ -89,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn any_beginning_shows_all_of_a_line() {
+    fn any_prefix_shows_all_of_a_line() {
         let points = |positions: &[[f32; 3]]| -> Vec<SurfacePoint> {
             let point =
                 |&position| SurfacePoint { position, keyframes: 3, ..SurfacePoint::default() };

@@ -1,36 +1,36 @@
-//! How keyframes are fused to one surface.
+//! Parameters of the fusion of keyframes into one surface.
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// How keyframes are fused.
+/// Parameters of the fusion.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FusionParams {
-    /// Distance of the points.
+    /// Distance between the points.
     pub resolution: MapResolution,
     /// Largest σ/d of a point that counts.
     pub max_relative_std_dev: f64,
-    /// Other keyframes that a point is compared with. 10: half of them overlap most, the others are spread over the run;
-    /// with 24 the simulated room has the same error.
+    /// Number of other keyframes that a point is compared with. 10: half of them have the largest overlap, the others
+    /// are spread over the run; with 24 the simulated room has the same error.
     pub max_neighbours: usize,
-    /// Standard deviations of both by which depths that agree may differ. 2: with 3, a third more points of the simulated
-    /// room are off by 3 %, as more of what is wrong is confirmed.
+    /// Standard deviations of both by which depths that agree may differ. 2: with 3, a third more points of the
+    /// simulated room are off by 3 %, as more errors are confirmed.
     pub tolerance: f64,
-    /// Share of the distance by which depths may differ besides. 0.01: places and units of keyframes are known no better
-    /// than that over the length of a room.
+    /// Share of the distance by which depths may differ in addition. 0.01: poses and units of keyframes are no more
+    /// accurate than that over the length of a room.
     pub floor: f64,
     /// Keyframes that must contradict a point before it is removed. 2: one may be wrong itself.
     pub min_contradictions: u8,
-    /// Keyframes that see through a point over those whose depth agrees, from which on it is removed. 0.5: those that agree
-    /// have their depth from each other, those that see through it do not.
+    /// Ratio of the keyframes that see through a point to those whose depth agrees, from which it is removed. 0.5:
+    /// those that agree have their depth from each other, those that see through it do not.
     pub contradiction_ratio: f64,
-    /// Pixels around with depth that agree, of the 48 of a square, at least. 8: half of a square that an edge crosses.
+    /// Fewest pixels with depth that agrees, of the 48 of the square around. 8: half of a square that an edge crosses.
     pub min_support: u32,
-    /// Share of the pixels around with depth that agree, at least. 0.7: at a step in depth half of them do.
+    /// Least share of the pixels around with depth that agrees. 0.7: at a step in depth half of them do.
     pub support_ratio: f64,
-    /// Other points within four sides of a point's cell, at least. 8: those of an edge that continues to both sides.
+    /// Fewest other points within four sides of a point's cell. 8: those of an edge that continues to both sides.
     pub min_company: usize,
 }
 
@@ -51,11 +51,11 @@ impl Default for FusionParams {
     }
 }
 
-/// Smallest cell in standard deviations along the ray: across the ray a point is known to a pixel, so that what is drawn
-/// on a far wall can still be read, and along it the wall is not more than a few cells thick.
+/// Smallest cell in standard deviations along the ray: across the ray a point is accurate to a pixel, so that print on
+/// a far wall stays legible, and along it the wall is no more than a few cells thick.
 const SIGMA_RATIO: f64 = 0.6;
 
-/// Distance between the points of a map; nowhere below 0.6 of their standard deviation or the width of a pixel.
+/// Distance between the points of a map; never below 0.6 of their standard deviation or the width of a pixel.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum MapResolution {
@@ -65,7 +65,7 @@ pub enum MapResolution {
     Relative(f64),
 }
 
-/// A resolution that is no length and no share.
+/// A resolution that is neither a length nor a share.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "`{0}` is not a resolution: give a length in map units above 0 (0.02), or a share of the distance up to 100% (0.5%)"
@@ -79,7 +79,7 @@ impl Default for MapResolution {
 }
 
 impl MapResolution {
-    /// Size of the cell of a point at `distance` from its camera, where a pixel is `pixel` wide, with standard deviation
+    /// Cell size of a point at `distance` from its camera, where a pixel is `pixel` wide, with standard deviation
     /// `sigma` along the ray; map units.
     pub(super) fn cell_size(&self, distance: f64, pixel: f64, sigma: f64) -> f64 {
         let size = match self {

@@ -1,22 +1,22 @@
-//! Which pixels of a keyframe have depth, and where it is in the list: two bits a pixel instead of an image.
+//! Maps the pixels of a keyframe with depth to their points: two bits per pixel instead of an image.
 
 use crate::slam::keyframe::{DepthPoint, Keyframe};
 
-/// Pixels of a word.
+/// Pixels per word.
 const WORD: usize = u64::BITS as usize;
 
-/// A bit for each pixel with depth, and how many come before each word.
+/// A bit for each pixel with depth, and the number of points before each word.
 #[derive(Debug, Clone)]
 pub(super) struct PixelIndex {
     width: usize,
     height: usize,
-    /// One bit more than there are pixels at least.
+    /// At least one bit more than there are pixels.
     words: Vec<u64>,
     before: Vec<u32>,
 }
 
 impl PixelIndex {
-    /// Of a keyframe; `None` where its points are not of its image or not in row-major order.
+    /// Indexes a keyframe; `None` where its points lie outside its image or are not in row-major order.
     pub fn of(keyframe: &Keyframe) -> Option<Self> {
         let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
         let mut words = vec![0u64; width * height / WORD + 1];
@@ -53,7 +53,7 @@ impl PixelIndex {
         if is_set { points.get(self.num_before(at)) } else { None }
     }
 
-    /// The points of the square that reaches `radius` pixels from (u, v) to each side, row by row.
+    /// The points of the square that extends `radius` pixels from (u, v) to each side, row by row.
     pub fn around<'a>(
         &self,
         points: &'a [DepthPoint],
@@ -69,7 +69,7 @@ impl PixelIndex {
         })
     }
 
-    /// Points before a pixel.
+    /// Number of points before a pixel.
     fn num_before(&self, at: usize) -> usize {
         let below = self.words[at / WORD] & ((1 << (at % WORD)) - 1);
         (self.before[at / WORD] + below.count_ones()) as usize
@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn points_out_of_order_or_out_of_the_image_are_refused() {
+    fn points_out_of_order_or_outside_the_image_are_refused() {
         for pixels in [
             [(5, 0), (4, 0)],
             [(5, 0), (5, 0)],

@@ -1,25 +1,25 @@
-//! One point for each place of a surface: of points nearer to each other than their cells are wide the better known stays,
-//! and those that are alone go.
+//! One point per spot of a surface: of points closer than the width of their cells the most certain stays, and isolated
+//! ones are removed.
 
 use rayon::prelude::*;
 
 use crate::slam::fusion::grid::Grid;
 use crate::slam::fusion::voxels::{Gathered, side};
 
-/// Least distance of two points, in sides of the larger one's cell: a surface that runs along a face of the grid has points
-/// in the cells on both sides of it.
+/// Least distance of two points, in sides of the larger one's cell: a surface along a face of the grid has points in
+/// the cells on both sides of it.
 const SPACING: f64 = 0.7;
-/// Distance within which a point has others, in sides of its cell.
+/// Distance within which a point needs others, in sides of its cell.
 const COMPANY_RADIUS: f64 = 4.0;
 
-/// A point that stays, as it is written.
+/// A point that is kept, with its position as written.
 type Placed = ([f32; 3], Gathered);
 
-/// Of points in order of their cells those that keep their distance and have `company` others around, in the same order.
+/// The points, in order of their cells, that keep their distance and have `company` others around; in the same order.
 pub(super) fn spaced(points: &[Gathered], company: usize) -> Vec<Placed> {
     let mut kept: Vec<Placed> = Vec::new();
     for of_octave in points.chunk_by(|a, b| a.cell.octave() == b.cell.octave()) {
-        // Cells come from the smallest to the largest: what is kept so far is known better.
+        // Cells are in ascending order of size: the points kept so far are more certain.
         let largest = SPACING * side(of_octave[of_octave.len() - 1].cell.level);
         let mut grid = Grid::new(2.0 * largest, kept.len() + of_octave.len());
         kept.iter().for_each(|(position, _)| grid.push(*position));

@@ -1,4 +1,4 @@
-//! Walls that several keyframes see, with points that are wrong.
+//! Walls seen by several keyframes, with wrong points.
 
 use nalgebra::Vector3;
 
@@ -15,7 +15,7 @@ const UNIT: f64 = 2.0;
 /// σ/d of all points.
 const NOISE: f64 = 0.01;
 
-/// A keyframe at `x`, which looks at the wall with `depth` of each pixel, in map units; none where it is NaN.
+/// A keyframe at `x` that faces the wall, with `depth` of each pixel, in map units; NaN for no depth.
 fn keyframe(keyframe_id: u64, x: f64, depth: impl Fn(u16, u16) -> f64) -> Keyframe {
     let pixels =
         (0..CAMERA.height as u16).flat_map(|v| (0..CAMERA.width as u16).map(move |u| (u, v)));
@@ -34,7 +34,7 @@ fn keyframe(keyframe_id: u64, x: f64, depth: impl Fn(u16, u16) -> f64) -> Keyfra
     }
 }
 
-/// Five of them side by side, the first with `depth`.
+/// Five of them in a row, the first with `depth`.
 fn row(depth: impl Fn(u16, u16) -> f64) -> Vec<Keyframe> {
     let others = (1..5).map(|i| keyframe(i, 0.02 * i as f64, |_, _| DEPTH));
     std::iter::once(keyframe(0, 0.0, depth)).chain(others).collect()
@@ -51,7 +51,7 @@ fn depth_range(points: &[SurfacePoint]) -> [f32; 2] {
 }
 
 #[test]
-fn a_wall_that_five_keyframes_see_is_one_layer_with_normals() {
+fn a_wall_seen_by_five_keyframes_is_one_layer_with_normals() {
     // Off by half of σ to either side: the mean is nearer.
     let off = |i: u64| DEPTH * (1.0 + 0.5 * NOISE * [-1.0, 1.0, 0.0, 1.0, -1.0][i as usize]);
     let row: Vec<Keyframe> =
@@ -75,8 +75,8 @@ fn a_wall_that_five_keyframes_see_is_one_layer_with_normals() {
 }
 
 #[test]
-fn what_others_see_through_goes_and_what_they_do_not_know_stays() {
-    // A patch hangs before the wall in one of them, large enough to have company.
+fn points_that_others_see_through_are_removed_and_unseen_ones_stay() {
+    // A patch hangs in front of the wall in one of them, large enough to have company.
     let is_patch = |u: u16, v: u16| (30..60).contains(&u) && (20..45).contains(&v);
     let hanging = |u, v| if is_patch(u, v) { 0.7 * DEPTH } else { DEPTH };
     let in_front = |points: &[SurfacePoint]| {
@@ -107,7 +107,7 @@ fn depth_that_is_too_uncertain_confirms_nothing() {
 }
 
 #[test]
-fn pixels_that_stand_alone_in_depth_go() {
+fn isolated_depths_are_removed() {
     let wrong = |u: u16, v: u16| u.is_multiple_of(16) && v.is_multiple_of(16) && u > 0 && v > 0;
     let lone = [keyframe(0, 0.0, |u, v| if wrong(u, v) { 1.3 * DEPTH } else { DEPTH })];
     let [near, far] = depth_range(&fused_of(&lone));
@@ -130,7 +130,7 @@ fn the_bits_do_not_depend_on_the_number_of_threads() {
 }
 
 #[test]
-fn a_coarser_resolution_has_fewer_points_and_progress_comes_to_its_end() {
+fn a_coarser_resolution_has_fewer_points_and_progress_reaches_its_end() {
     let row = row(|_, _| DEPTH);
     let keyframes: Vec<&Keyframe> = row.iter().collect();
     let mut last = (0, 0);
@@ -149,7 +149,7 @@ fn a_coarser_resolution_has_fewer_points_and_progress_comes_to_its_end() {
 }
 
 #[test]
-fn broken_keyframes_are_left_out() {
+fn invalid_keyframes_are_left_out() {
     assert!(fused_of(&[]).is_empty());
     let mut row = row(|_, _| DEPTH);
     for (i, point) in row[0].points.iter_mut().enumerate() {

@@ -1,4 +1,4 @@
-//! A keyframe as fusion looks at it, and how another one sees its points.
+//! A keyframe as used in fusion, and how another one sees its points.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -15,18 +15,18 @@ pub(super) struct View<'a> {
     pub index: PixelIndex,
 }
 
-/// What another keyframe knows of a point.
+/// How another keyframe's depth relates to a point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Opinion {
-    /// The point is on the surface that it sees: inverse depth of that surface in the first keyframe, and its variance.
+    /// The point is on the other's surface: inverse depth of that surface in the first keyframe, and its variance.
     Agrees(f64, f64),
     /// It sees through the point: the surface is behind it.
     SeesThrough,
-    /// Its surface stands before the point: hidden, or wrong.
+    /// The other's surface is in front of the point: hidden, or wrong.
     Hides,
 }
 
-/// From the pixels of one keyframe to those of another: `q = A r + t d` of a ray r at depth 1 with inverse depth d.
+/// Maps the pixels of one keyframe to those of another: `q = A r + t d` of a ray r at depth 1 with inverse depth d.
 #[derive(Debug)]
 pub(super) struct Sight<'a> {
     into: &'a View<'a>,
@@ -35,7 +35,7 @@ pub(super) struct Sight<'a> {
 }
 
 impl<'a> View<'a> {
-    /// Of a keyframe that is proven, has depth and a place; `None` of others.
+    /// The view of an established keyframe with depth and a valid pose; `None` for others.
     pub fn of(keyframe: &'a Keyframe) -> Option<Self> {
         let is_usable = keyframe.map_state == MapState::Established
             && keyframe.map_from_keyframe.is_valid()
@@ -49,7 +49,7 @@ impl<'a> View<'a> {
         self.keyframe.intrinsics.ray(u, v)
     }
 
-    /// The points of the square that reaches `radius` pixels to each side of a point, itself among them.
+    /// The points of the square that extends `radius` pixels to each side of a point, itself included.
     pub fn around(
         &self,
         point: &DepthPoint,
@@ -64,14 +64,14 @@ impl<'a> View<'a> {
     }
 }
 
-/// Pixels around the nearest one where depth is looked for, the nearest first: a point of an edge is a pixel aside in
-/// another keyframe as easily as not.
+/// Pixels around the nearest one in which depth is searched, the nearest first: a point of an edge may just as well be
+/// a pixel off in another keyframe.
 const AROUND: [(i32, i32); 5] = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)];
 /// Least depth in another keyframe over the depth in its own: nearer, a pixel's error is many pixels there.
 const NEAREST_RATIO: f64 = 0.1;
 
 impl<'a> Sight<'a> {
-    /// How `into` sees the points of `from`.
+    /// The projection of the points of `from` into `into`.
     pub fn new(from: &View<'_>, into: &'a View<'a>) -> Self {
         let into_from_from =
             into.keyframe.map_from_keyframe.inverse() * from.keyframe.map_from_keyframe;
@@ -82,9 +82,9 @@ impl<'a> Sight<'a> {
         }
     }
 
-    /// What the other keyframe knows of a point with this ray, inverse depth and variance, where errors beyond
-    /// `tolerance` standard deviations, and beyond a share `floor` of the distance in all, are contradictions. Depth too
-    /// uncertain to count knows nothing.
+    /// The other keyframe's opinion of a point with this ray, inverse depth and variance; errors beyond `tolerance`
+    /// standard deviations, and beyond a share `floor` of the distance in all, are contradictions. `None` where it has
+    /// no depth that is certain enough.
     pub fn opinion(
         &self,
         ray: &Vector3<f64>,
@@ -126,9 +126,9 @@ impl<'a> Sight<'a> {
         against
     }
 
-    /// What an inverse depth e of the other keyframe is along the ray.
+    /// Converts an inverse depth e of the other keyframe to one along the ray.
     fn back(&self, turned_z: f64, e: f64, variance: f64) -> Option<Opinion> {
-        /// Below, the ray runs across the other's view, and its depth says little of the point's.
+        /// Below, the ray runs across the other's view, and its depth tells little about the point's.
         const LEAST: f64 = 0.1;
         let rest = 1.0 - e * self.translation.z;
         if !(rest > LEAST) {

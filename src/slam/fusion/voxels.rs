@@ -1,18 +1,18 @@
-//! Points gathered in cells of space whose size follows what is known of them.
+//! Points gathered in cells of space whose size follows their uncertainty.
 
 use std::cmp::Ordering;
 
-/// Sizes of cells between one and the next twice as large.
+/// Number of cell sizes per factor of two.
 const STEPS_PER_OCTAVE: f64 = 2.0;
-/// Largest number of a cell along an axis, of either sign.
+/// Largest index of a cell along an axis, of either sign.
 const MOST_CELLS: f64 = 1e9;
 
-/// A cell: its size and its place.
+/// A cell: its size and its position.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Cell {
-    /// Its size: [`side`].
+    /// Its size level, see [`side`].
     pub level: i16,
-    /// Its number along each axis.
+    /// Its index along each axis.
     pub at: [i32; 3],
 }
 
@@ -22,12 +22,12 @@ pub(super) fn side(level: i16) -> f64 {
 }
 
 impl Cell {
-    /// Cells of one octave differ in size by less than a factor of two.
+    /// Octave of the cell: within one, sizes differ by less than a factor of two.
     pub fn octave(&self) -> i16 {
         self.level.div_euclid(STEPS_PER_OCTAVE as i16)
     }
 
-    /// The cell, of a size of at most `size`, that holds a position; `None` where either is no sane number.
+    /// The cell, of a size of at most `size`, that contains a position; `None` where either is out of range.
     pub fn of(position: [f64; 3], size: f64) -> Option<Self> {
         let level = (STEPS_PER_OCTAVE * size.log2()).floor();
         if !(level.abs() < 1000.0) {
@@ -40,7 +40,7 @@ impl Cell {
     }
 }
 
-/// What the points of a cell come to.
+/// Sums over the points of a cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Gathered {
     /// The cell.
@@ -51,14 +51,14 @@ pub(super) struct Gathered {
     weight: f32,
     /// Smallest standard deviation along the ray, map units.
     pub sigma: f32,
-    /// Most keyframes that any of its points has.
+    /// Largest number of keyframes of any of its points.
     pub keyframes: u8,
-    /// The point of the smallest standard deviation: place of its keyframe, and of the point there.
+    /// The point with the smallest standard deviation: index of its keyframe, and of the point there.
     pub best: (u32, u32),
 }
 
 impl Gathered {
-    /// Of one point, `sigma` in map units.
+    /// From one point, `sigma` in map units.
     pub fn new(
         cell: Cell,
         position: [f64; 3],
@@ -108,7 +108,7 @@ impl Gathered {
     }
 }
 
-/// One for each cell, in order of the cells; those of a cell are added up in the order in which they come.
+/// One entry per cell, in order of the cells; the points of a cell are summed in their order of arrival.
 pub(super) fn gathered(mut points: Vec<Gathered>) -> Vec<Gathered> {
     points.sort_by_key(|point| point.cell);
     points.dedup_by(|later, kept| {
@@ -121,7 +121,7 @@ pub(super) fn gathered(mut points: Vec<Gathered>) -> Vec<Gathered> {
     points
 }
 
-/// Both in one list; where both have a cell, the second's is added to the first's.
+/// Merges two lists; where both have a cell, the second's is added to the first's.
 pub(super) fn merged(first: Vec<Gathered>, second: Vec<Gathered>) -> Vec<Gathered> {
     if first.is_empty() {
         return second;

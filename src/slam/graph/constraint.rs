@@ -1,8 +1,8 @@
 //! The relative similarity of two keyframes by direct alignment of image and depth (Engel, Schöps, Cremers 2014, §3.5).
 //!
-//! [`ConstraintSolver::measure`] is the recipe: each keyframe is aligned to the other (`residual`, `align`, from where
-//! `start` finds that it begins best), each alignment must pass for itself (`verdict`), and both must agree
-//! within what they claim (`covariance`). What is left becomes a constraint of the pose graph.
+//! [`ConstraintSolver::measure`] is the recipe: each keyframe is aligned to the other (`residual`, `align`, from the
+//! best initial value that `start` finds), each alignment must pass on its own (`verdict`), and both must agree within
+//! their covariances (`covariance`). The result becomes a constraint of the pose graph.
 
 mod align;
 mod covariance;
@@ -32,27 +32,27 @@ pub use view::KeyframeView;
 pub struct ConstraintParams {
     /// Points and finest level of each keyframe.
     pub reference: ReferenceParams,
-    /// Noise, robust weights, priors of the brightness and most iterations.
+    /// Noise, robust weights, priors of the brightness and maximum iterations.
     pub alignment: AlignmentParams,
-    /// A level is done when a step is shorter than this, in standard deviations by the level's own information.
+    /// A level has converged when a step is shorter than this, in standard deviations by the level's own information.
     pub step_tolerance: f64,
-    /// Standard deviation of depth that is looked up beside the pixel it belongs to, as a share of it.
+    /// Relative standard deviation of depth that is extrapolated from the pixel it belongs to.
     pub depth_model_ratio: f64,
-    /// The same on coarser levels, where a pose is still wrong by pixels: depth holds the scale there and no more.
+    /// The same on coarser levels, where a pose is still wrong by pixels: there depth constrains the scale and no more.
     pub coarse_depth_ratio: f64,
-    /// Inflation of the covariance that the scatter over tiles gives.
+    /// Inflation of the covariance from the scatter over tiles.
     pub covariance_inflation: f64,
     /// Displacement of whole images.
     pub displacement: CovarianceFloorParams,
     /// Standard deviation of ln s that remains however much depth is compared.
     pub scale_std_dev: f64,
-    /// What is accepted.
+    /// Gates that a measurement must pass.
     pub gates: GateParams,
 }
 
 impl Default for ConstraintParams {
     fn default() -> Self {
-        /// Points of a level, finest first: a third of a frame's, since nine unknowns need no more and two alignments
+        /// Points per level, finest first: a third of a frame's, since nine unknowns need no more and two alignments
         /// are made.
         const POINT_BUDGET: [usize; MAX_LEVELS] = [4000, 4000, 3000, 2000, 1200];
         let reference = ReferenceParams { point_budget: POINT_BUDGET, ..Default::default() };
@@ -83,7 +83,7 @@ pub struct KeyframeAlignment {
     pub usage: f64,
     /// Share of those that are inliers.
     pub inlier_share: f64,
-    /// How far tiles of the images agree.
+    /// Agreement between tiles of the images.
     pub agreement: TileAgreement,
     /// Share of the points in view that meet depth of j.
     pub depth_share: f64,
@@ -99,11 +99,11 @@ pub struct Measurement {
     /// The similarity: both alignments, weighted by their information.
     pub j_from_i: Sim3,
     /// Covariance of its left increment (translation, rotation, log scale), in units of j. Both alignments see the same
-    /// pixels, so that it is their mean information, not the sum.
+    /// pixels, so it comes from their mean information, not the sum.
     pub covariance: Matrix7,
     /// The alignment of i to j, and of j to i.
     pub alignments: [KeyframeAlignment; 2],
-    /// Squared normalised difference of the two, χ² with seven degrees of freedom if both are as sure as they claim.
+    /// Squared normalised difference of the two, χ² with seven degrees of freedom if both covariances are right.
     pub reciprocal_chi2: f64,
 }
 
@@ -114,7 +114,7 @@ pub struct ConstraintSolver {
 }
 
 impl ConstraintSolver {
-    /// With its tuning.
+    /// A solver with this tuning.
     pub fn new(params: ConstraintParams) -> Self {
         Self { params }
     }
@@ -124,7 +124,7 @@ impl ConstraintSolver {
         KeyframeView::new(keyframe, &self.params.reference)
     }
 
-    /// Measures `j_from_i` from what is known of it.
+    /// Measures `j_from_i` from an initial rotation or similarity.
     pub fn measure(
         &self,
         i: &KeyframeView,
@@ -145,7 +145,7 @@ impl ConstraintSolver {
         Ok(measurement)
     }
 
-    /// Aligns i to j, whatever comes of it.
+    /// Aligns i to j without judging the result.
     fn align(
         &self,
         i: &KeyframeView,
@@ -189,7 +189,7 @@ impl ConstraintSolver {
     }
 }
 
-/// Both alignments as one of `j_from_i`; `None` where a covariance has no inverse.
+/// Fuses both alignments into one of `j_from_i`; `None` where a covariance has no inverse.
 fn fuse(forward: KeyframeAlignment, backward: KeyframeAlignment) -> Option<Measurement> {
     // S_ji S_ij and the left increment of S_ji⁻¹: −Ad(S_ji⁻¹) times that of S_ji.
     let adjoint = forward.j_from_i.adjoint();
@@ -200,7 +200,7 @@ fn fuse(forward: KeyframeAlignment, backward: KeyframeAlignment) -> Option<Measu
     let informations =
         [forward.covariance.cholesky()?.inverse(), of_backward.cholesky()?.inverse()];
     let sum = (informations[0] + informations[1]).cholesky()?;
-    // From the forward one to the other: exp(−difference) forward.
+    // The backward alignment is exp(−difference) times the forward one.
     let step = sum.solve(&(informations[1] * -difference));
     Some(Measurement {
         j_from_i: Sim3::exp(&step) * forward.j_from_i,

@@ -1,4 +1,4 @@
-//! Dense Cholesky steps of a front, compiled for the vector units that the processor has.
+//! Dense Cholesky steps of a front, compiled for the vector units of the processor.
 //!
 //! One source for all: no operation is fused or reordered, so every version gives the same bits.
 
@@ -8,14 +8,14 @@ use crate::slam::kernel::{Body, Instructions};
 const TILE: usize = 8;
 /// Columns that are eliminated before the rest is updated: their part of a front fits the second-level cache.
 const PANEL: usize = 48;
-/// A pivot that has lost all but this share of its original value is rounding.
+/// A pivot below this share of its original value is rounding error.
 const LEAST_PIVOT: f64 = 1e-13;
 
 /// A pivot was not positive: its column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct NotPositive(pub usize);
 
-/// A symmetric matrix of which the first columns, as many as `least` has, are to be eliminated: lower triangle by columns.
+/// A symmetric matrix whose first `least.len()` columns are to be eliminated: lower triangle by columns.
 pub(super) struct Part<'a> {
     /// Rows of the matrix.
     pub size: usize,
@@ -23,7 +23,7 @@ pub(super) struct Part<'a> {
     pub least: &'a [f64],
     /// The columns that are eliminated, `size` rows each.
     pub factor: &'a mut [f64],
-    /// The other columns, with their own rows alone.
+    /// The other columns, without the rows of the eliminated ones.
     pub rest: &'a mut [f64],
     /// Scratch.
     pub packed: &'a mut Vec<f64>,
@@ -32,7 +32,7 @@ pub(super) struct Part<'a> {
 impl Body for Part<'_> {
     type Output = Result<(), NotPositive>;
 
-    /// Eliminates the columns; `factor` has the factor's then, and `rest` what is left.
+    /// Eliminates the columns; afterwards `factor` holds those of the factor, and `rest` the Schur complement.
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) -> Result<(), NotPositive> {
         let Self { size, least, factor, rest, packed } = self;
@@ -116,8 +116,8 @@ fn pack(panel: &[f64], stride: usize, from: usize, size: usize, packed: &mut Vec
     }
 }
 
-/// Takes A Aᵀ from the lower triangle of `target`, A packed by tiles of `width` numbers: its `columns`, with `rows` rows of
-/// `stride` numbers a column.
+/// Subtracts A Aᵀ from the lower triangle of `target`, A packed by tiles of `width` numbers: its `columns`, with `rows`
+/// rows and `stride` numbers per column.
 #[inline(always)]
 fn subtract_products(
     packed: &[f64],
@@ -201,14 +201,14 @@ mod tests {
         }
         let least: Vec<f64> = (0..pivots).map(|k| matrix[k * size + k]).collect();
         eliminate_in(kernel, size, &least, &mut factor, &mut rest).unwrap();
-        // Above the diagonal nothing is said.
+        // The part above the diagonal is undefined.
         (0..pivots).for_each(|c| factor[c * size..c * size + c].fill(0.0));
         (0..others).for_each(|c| rest[c * others..c * others + c].fill(0.0));
         (factor, rest)
     }
 
     #[test]
-    fn all_versions_give_the_same_bits_and_the_factor_gives_the_matrix() {
+    fn all_versions_give_the_same_bits_and_the_factor_reproduces_the_matrix() {
         for (size, pivots) in [(1, 1), (7, 7), (20, 6), (33, 32), (150, 117), (130, 130)] {
             let matrix = matrix(size, size as u64);
             let (factor, rest) = run(Kernel::Portable, &matrix, size, pivots);
@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn a_matrix_that_is_not_positive_is_refused() {
+    fn a_matrix_that_is_not_positive_definite_is_refused() {
         let mut factor = vec![1.0, 1.0, 1.0, 1.0];
         let singular = eliminate_in(Kernel::Portable, 2, &[1.0, 1.0], &mut factor, &mut []);
         assert_eq!(singular, Err(NotPositive(1)));

@@ -1,4 +1,4 @@
-//! Sparse Cholesky factorisation of a matrix of blocks, by fronts.
+//! Sparse Cholesky factorisation of a block matrix, by fronts.
 
 use nalgebra::SMatrix;
 
@@ -7,14 +7,14 @@ use crate::slam::graph::dense_kernel::{NotPositive, Part};
 use crate::slam::graph::fronts::{Front, Plan};
 use crate::slam::kernel::Kernel;
 
-/// The factor of a symmetric positive definite matrix with blocks of `D` × `D`, and the memory to make it.
+/// The factor of a symmetric positive definite matrix with blocks of `D` × `D`, and the memory to compute it.
 #[derive(Debug, Clone)]
 pub(super) struct Factorisation<const D: usize> {
     plan: Plan,
     kernel: Kernel,
-    /// By front: the columns that were eliminated in it, of all its rows.
+    /// By front: the columns eliminated in it, with all its rows.
     factors: Vec<Vec<f64>>,
-    /// By front: what it adds to its parent, until that has taken it.
+    /// By front: its update of the parent, until the parent has taken it.
     rests: Vec<Vec<f64>>,
     packed: Vec<f64>,
     diagonal: Vec<f64>,
@@ -23,7 +23,7 @@ pub(super) struct Factorisation<const D: usize> {
 
 impl<const D: usize> Factorisation<D> {
     /// For a matrix of `num_nodes` diagonal blocks and a block for each of `pairs` (row, column), which are distinct;
-    /// nothing large is allocated where that is more than `most_bytes`.
+    /// allocates nothing large if that would exceed `most_bytes`.
     pub fn new(
         num_nodes: usize,
         pairs: &[(usize, usize)],
@@ -46,8 +46,8 @@ impl<const D: usize> Factorisation<D> {
         })
     }
 
-    /// Factorises the matrix whose blocks these are, diagonal ones first, with each diagonal element enlarged by the share
-    /// `damping`. False where it is not positive definite; there is no factor then.
+    /// Factorises the matrix with these blocks, diagonal ones first, with each diagonal element enlarged by the share
+    /// `damping`. Returns false, and there is no factor, where it is not positive definite.
     pub fn factorise(&mut self, blocks: &[SMatrix<f64, D, D>], damping: f64) -> bool {
         for number in 0..self.plan.fronts.len() {
             let front = &self.plan.fronts[number];
@@ -76,7 +76,7 @@ impl<const D: usize> Factorisation<D> {
         true
     }
 
-    /// Solves for a right side in node order, in place.
+    /// Solves for a right-hand side in node order, in place.
     pub fn solve(&mut self, values: &mut [f64]) {
         for (front, factor) in self.plan.fronts.iter().zip(&self.factors) {
             let (size, pivots) = (D * front.nodes.len(), D * front.num_pivots);
@@ -124,7 +124,7 @@ impl<const D: usize> Factorisation<D> {
     }
 }
 
-/// Writes what of the matrix belongs to a front.
+/// Writes the blocks of the matrix that belong to a front.
 fn enter<const D: usize>(
     front: &Front,
     blocks: &[SMatrix<f64, D, D>],
@@ -161,7 +161,7 @@ fn extend_add<const D: usize>(
         for c in 0..D {
             let column = D * place + c;
             let from = &from[(D * j + c) * from_size..][..from_size];
-            // The column of the front from its first row on that is stored.
+            // The column of the front from its first stored row.
             let (into, above) = if column < pivots {
                 (&mut factor[column * size..][..size], 0)
             } else {
@@ -185,7 +185,7 @@ mod tests {
     use crate::slam::test_scene::Random;
 
     #[test]
-    fn solutions_are_those_of_the_dense_matrix() {
+    fn solutions_match_the_dense_matrix() {
         const D: usize = 3;
         for seed in 0..30u64 {
             let mut random = Random::new(seed);
@@ -193,7 +193,7 @@ mod tests {
             let mut pairs = Vec::new();
             for row in 0..nodes {
                 for column in 0..row {
-                    // A chain, and more the higher the seed; some with the row before the column.
+                    // A chain, and more blocks the higher the seed; some with the row before the column.
                     if column + 1 == row || random.uniform() < seed as f64 / 300.0 {
                         let is_swapped = random.uniform() < 0.5;
                         pairs.push(if is_swapped { (column, row) } else { (row, column) });
@@ -217,7 +217,7 @@ mod tests {
             let expected = dense.clone().cholesky().expect("diagonally dominant").solve(&right);
             let new = |most| Factorisation::<D>::new(nodes, &pairs, Kernel::Portable, most);
             let mut factorisation = new(usize::MAX).unwrap();
-            // Twice: the memory is used again.
+            // Twice: the memory is reused.
             for _ in 0..2 {
                 assert!(factorisation.factorise(&blocks, 0.5));
                 let mut values = right.as_slice().to_vec();
@@ -225,7 +225,7 @@ mod tests {
                 let error = (DVector::from_vec(values) - &expected).norm() / expected.norm();
                 assert!(error < 1e-12, "seed {seed}: {error}");
             }
-            // As much as it takes, and a byte less.
+            // Exactly as much as needed, and a byte less.
             let columns: usize = factorisation.factors.iter().map(|factor| 8 * factor.len()).sum();
             let bytes = factorisation.plan.most_blocks() * size_of::<SMatrix<f64, D, D>>();
             assert!(columns <= bytes, "seed {seed}: {columns} {bytes}");

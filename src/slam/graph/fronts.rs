@@ -1,23 +1,23 @@
 //! The plan of a sparse Cholesky factorisation: which keyframes are eliminated together, in which dense matrix.
 //!
-//! Columns of the factor with the same structure, or nearly, are eliminated together in a dense *front* (the multifrontal
-//! method: Duff, Reid 1983; Liu 1992). Its lower right part is added to the front of its parent. Made once for a
-//! graph and used in every iteration.
+//! Columns of the factor with (nearly) the same structure are eliminated together in a dense *front* (the multifrontal
+//! method: Duff, Reid 1983; Liu 1992). Its lower right part is added to the front of its parent. The plan is made once
+//! per graph and used in every iteration.
 
 use crate::slam::graph::ordering::{Column, minimum_degree};
 
-/// A front may hold this share of zeros that a front for each column would not: larger products cost less than the
-/// operations saved. Shares by the number of keyframes that are eliminated in it.
+/// Share of zeros that a front may contain in excess of separate fronts for its columns: larger products cost less than
+/// the operations saved. Shares by the number of keyframes that are eliminated in it.
 const MAX_ZEROS: [(usize, f64); 3] = [(2, 0.6), (6, 0.2), (usize::MAX, 0.05)];
 
 /// A part of the matrix that is added to a front: the block of nodes (row, column) or its transpose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Entry {
-    /// Number of the block among those of the matrix.
+    /// Index of the block in the matrix.
     pub block: usize,
-    /// Where in the front, in nodes; row ≥ column.
+    /// Row in the front, in nodes; row ≥ column.
     pub row: usize,
-    /// The same.
+    /// Column in the front, in nodes.
     pub column: usize,
     /// Whether the block is stored for (column, row).
     pub is_transposed: bool,
@@ -26,26 +26,26 @@ pub(super) struct Entry {
 /// A dense matrix in which some nodes are eliminated.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Front {
-    /// Nodes: first those that are eliminated here, then what they are connected to, in order of elimination.
+    /// Nodes: first those that are eliminated here, then those they are connected to, in order of elimination.
     pub nodes: Vec<usize>,
     /// Number of those that are eliminated.
     pub num_pivots: usize,
-    /// What of the matrix enters here.
+    /// The blocks of the matrix that are added here.
     pub entries: Vec<Entry>,
-    /// Fronts whose lower right part enters here, with the place of each of its nodes.
+    /// Fronts whose lower right part is added here, with the positions of their nodes.
     pub children: Vec<Child>,
 }
 
 /// A front that is added to another.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Child {
-    /// Its number.
+    /// Its index.
     pub front: usize,
-    /// For each node that was not eliminated in it: its place here.
+    /// For each node that was not eliminated in it: its position here.
     pub places: Vec<usize>,
 }
 
-/// Fronts in an order in which children come before their parents.
+/// Fronts ordered so that children precede their parents.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Plan {
     /// The fronts.
@@ -55,8 +55,8 @@ pub(super) struct Plan {
 }
 
 impl Plan {
-    /// The plan for a symmetric matrix of `num_nodes` diagonal blocks and a block for each of `pairs` (row, column), which
-    /// are distinct; `None` where the factor has more than `most_blocks` blocks.
+    /// The plan for a symmetric matrix of `num_nodes` diagonal blocks and a block for each of `pairs` (row, column),
+    /// which are distinct; `None` where the factor has more than `most_blocks` blocks.
     pub fn new(num_nodes: usize, pairs: &[(usize, usize)], most_blocks: usize) -> Option<Self> {
         let mut neighbours = vec![Vec::new(); num_nodes];
         for &(row, column) in pairs {
@@ -69,7 +69,7 @@ impl Plan {
         Some(plan)
     }
 
-    /// Most blocks that are in memory at a time: the columns of all fronts, and the lower right parts that wait for their
+    /// Peak number of blocks in memory: the columns of all fronts, and the lower right parts that wait for their
     /// parents.
     pub fn most_blocks(&self) -> usize {
         let rest = |front: &Front| (front.nodes.len() - front.num_pivots).pow(2);
@@ -107,7 +107,7 @@ impl Plan {
     }
 }
 
-/// Place of a node in a front's list, which is in order of elimination.
+/// Position of a node in a front's list, which is in order of elimination.
 fn place_in(nodes: &[usize], position: &[usize], node: usize) -> usize {
     let found = nodes.binary_search_by_key(&position[node], |&other| position[other]);
     found.expect("what a node is connected to lies in its front")
@@ -118,14 +118,14 @@ fn place_in(nodes: &[usize], position: &[usize], node: usize) -> usize {
 struct Group {
     pivots: Vec<usize>,
     rows: Vec<usize>,
-    /// Blocks of the factor, and those of them that are zero.
+    /// Blocks of the factor, and how many of them are zero.
     blocks: usize,
     zeros: usize,
     parent: Option<usize>,
 }
 
-/// Puts columns together with the next one up the elimination tree where that adds few zeros. What has been put into
-/// another is left without pivots.
+/// Merges columns into the next one up the elimination tree where that adds few zeros. A merged group is left without
+/// pivots.
 fn amalgamate(columns: Vec<Column>) -> Vec<Group> {
     let mut step_of = vec![0; columns.len()];
     for (step, column) in columns.iter().enumerate() {
@@ -164,7 +164,7 @@ fn arrange(groups: Vec<Group>, num_nodes: usize) -> Vec<Front> {
     for (number, group) in groups.iter().enumerate() {
         group.pivots.iter().for_each(|&node| group_of[node] = number);
     }
-    // The parent is the group that the first of the rows went to.
+    // The parent is the group into which the first of the rows was merged.
     let mut children: Vec<Vec<usize>> = vec![Vec::new(); groups.len()];
     let mut roots = Vec::new();
     let resolve = |mut group: usize| {

@@ -1,4 +1,4 @@
-//! How sure the places of a pose graph are.
+//! Covariances of the vertices of a pose graph.
 
 use nalgebra::SMatrix;
 
@@ -8,8 +8,8 @@ use crate::slam::graph::pose_graph::{PoseGraph, VertexId};
 use crate::slam::graph::system::System;
 use crate::slam::graph::{GraphParams, MAX_FACTOR_BYTES, SolveError, check_gauge};
 
-/// The equations at the places of a graph, factorised; each query solves for one or two keyframes. Kernels weigh as they
-/// do in the optimum; with known scale its variance is 0.
+/// The equations at the current estimate of a graph, factorised; each query solves for one or two keyframes. Robust
+/// kernels have their weights at the optimum; with known scale its variance is 0.
 #[derive(Debug, Clone)]
 pub struct Marginals {
     factor: Factor,
@@ -30,7 +30,7 @@ struct Queries<const D: usize> {
 }
 
 impl Marginals {
-    /// Factorises the equations of a graph at its places, which should be the optimum.
+    /// Factorises the equations of a graph at its current estimate, which should be the optimum.
     pub fn new(graph: &PoseGraph, params: &GraphParams) -> Result<Self, SolveError> {
         check_gauge(graph)?;
         let places: Vec<Sim3> = graph.vertices().iter().map(|v| v.map_from_keyframe).collect();
@@ -53,7 +53,7 @@ impl Marginals {
         Some(aa - cross - cross.transpose() + adjoint * bb * adjoint.transpose())
     }
 
-    /// Σ_aa, Σ_ba and Σ_bb of increments from the right.
+    /// Σ_aa, Σ_ba and Σ_bb of right increments.
     fn joint(&mut self, a: usize, b: usize) -> [Matrix7; 3] {
         match &mut self.factor {
             Factor::Similarity(queries) => queries.joint(a, b),
@@ -80,7 +80,7 @@ impl<const D: usize> Queries<D> {
         [aa, ba, bb]
     }
 
-    /// Columns of the inverse that belong to `a`: its own rows, and those of `b`. 0 for fixed ones.
+    /// Columns of the inverse that belong to `a`: its own rows, and those of `b`. 0 for fixed vertices.
     fn columns(&mut self, a: usize, b: usize) -> (Matrix7, Matrix7) {
         let (mut own, mut other) = (Matrix7::zeros(), Matrix7::zeros());
         let Some(node) = self.node_of[a] else { return (own, other) };

@@ -1,22 +1,22 @@
 //! A fill-reducing order of elimination: approximate minimum degree (Amestoy, Davis, Duff 1996) on keyframes.
 //!
-//! The graph of what is left is kept as a quotient graph: an eliminated keyframe becomes an *element*, which stands for
-//! all edges between the keyframes that it was connected to. The keyframes of an element are the structure of a column
-//! of the factor, exactly; only the degrees by which the next one is chosen are bounds.
+//! The remaining graph is kept as a quotient graph: an eliminated keyframe becomes an *element*, which represents all
+//! edges between the keyframes that it was connected to. The keyframes of an element are exactly the structure of a
+//! column of the factor; only the degrees by which the next one is chosen are bounds.
 
 use std::collections::BTreeSet;
 
-/// A keyframe that is eliminated, and what of the rest it was connected to by then.
+/// An eliminated keyframe, and the remaining ones it was connected to at that point.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Column {
-    /// Its number.
+    /// Its index.
     pub pivot: usize,
-    /// The rows of its column of the factor below the diagonal, in no order.
+    /// The rows of its column of the factor below the diagonal, in no particular order.
     pub rows: Vec<usize>,
 }
 
 /// The order of elimination of the nodes of a graph, given by the neighbours of each, with the structure of the factor.
-/// Of several nodes of the same degree the first is taken. `None` where the factor has more than `most_blocks` blocks.
+/// Among nodes of equal degree the first is taken. `None` where the factor has more than `most_blocks` blocks.
 pub(super) fn minimum_degree(neighbours: &[Vec<usize>], most_blocks: usize) -> Option<Vec<Column>> {
     let mut quotient = Quotient::new(neighbours);
     let mut order = Vec::with_capacity(neighbours.len());
@@ -33,20 +33,20 @@ pub(super) fn minimum_degree(neighbours: &[Vec<usize>], most_blocks: usize) -> O
 }
 
 struct Quotient {
-    /// Neighbours of a node that no element stands for.
+    /// Neighbours of a node that are not represented by an element.
     direct: Vec<Vec<usize>>,
     /// Elements that a node belongs to.
     elements: Vec<Vec<usize>>,
-    /// Nodes of an element, by its pivot; those that were eliminated since are gone with the element.
+    /// Nodes of an element, by its pivot; when one of them is eliminated, the element is absorbed.
     members: Vec<Vec<usize>>,
     is_element: Vec<bool>,
     degree: Vec<usize>,
-    /// (degree, node) of those that are left.
+    /// (degree, node) of the remaining nodes.
     queue: BTreeSet<(usize, usize)>,
     /// Pivot + 1 of the elimination in which a node was last a row, or an element last counted.
     row_of: Vec<usize>,
     counted_in: Vec<usize>,
-    /// Nodes of an element that are not rows of the present elimination.
+    /// Nodes of an element that are not rows of the current elimination.
     outside: Vec<usize>,
 }
 
@@ -67,14 +67,14 @@ impl Quotient {
         }
     }
 
-    /// Makes a node an element; its rows.
+    /// Turns a node into an element and returns its rows.
     fn eliminate(&mut self, pivot: usize) -> Vec<usize> {
         let mark = pivot + 1;
         let rows = self.rows_of(pivot, mark);
         self.count_outside(&rows, mark);
         for &row in &rows {
             let (row_of, is_element, outside) = (&self.row_of, &self.is_element, &self.outside);
-            // The new element stands for edges among its rows, and for elements that lie within it.
+            // The new element represents the edges among its rows, and elements that lie within it.
             self.direct[row].retain(|&other| row_of[other] != mark && other != pivot);
             self.elements[row].retain(|&e| is_element[e] && outside[e] > 0);
             let through_elements: usize = self.elements[row].iter().map(|&e| outside[e]).sum();
@@ -91,7 +91,7 @@ impl Quotient {
         rows
     }
 
-    /// What the pivot is connected to, directly or through elements, which the new element takes the place of.
+    /// The nodes that the pivot is connected to, directly or through elements, which the new element absorbs.
     fn rows_of(&mut self, pivot: usize, mark: usize) -> Vec<usize> {
         self.row_of[pivot] = mark;
         let mut rows = Vec::new();
@@ -113,7 +113,7 @@ impl Quotient {
         rows
     }
 
-    /// For every element that shares a row: how many of its nodes are no rows.
+    /// For every element that shares a row: how many of its nodes are not rows.
     fn count_outside(&mut self, rows: &[usize], mark: usize) {
         for &row in rows {
             for &element in &self.elements[row] {
@@ -132,7 +132,7 @@ mod tests {
     use super::*;
     use crate::slam::test_scene::Random;
 
-    /// The structure of the factor as it follows from its definition.
+    /// The structure of the factor by definition.
     fn eliminate_plainly(neighbours: &[Vec<usize>], order: &[Column]) -> Vec<Vec<usize>> {
         let mut left: Vec<BTreeSet<usize>> =
             neighbours.iter().map(|n| n.iter().copied().collect()).collect();
@@ -205,7 +205,7 @@ mod tests {
                 near
             })
             .collect();
-        // Row by row it is about 20 for each of 400 nodes: less than half of that.
+        // Row by row it is about 20 for each of 400 nodes: require less than half of that.
         assert!(fill(&grid) < 3800, "{}", fill(&grid));
     }
 }

@@ -1,22 +1,22 @@
-//! What a pose graph is made of: keyframes with their places, and measurements between two of them.
+//! The problem of a pose graph: keyframes with their similarities, and measurements between pairs of them.
 
 use crate::slam::geometry::sim3::{Matrix7, Sim3};
 use crate::slam::graph::robust::RobustKernel;
 
-/// Most keyframes of a graph: at ten keyframes a minute a week of mapping.
+/// Maximum number of keyframes of a graph: a week of mapping at ten keyframes a minute.
 pub const MAX_VERTICES: usize = 100_000;
-/// Most constraints of a graph: twenty a keyframe.
+/// Maximum number of constraints of a graph: twenty per keyframe.
 pub const MAX_CONSTRAINTS: usize = 2_000_000;
-/// An information matrix may differ from its transpose, and be negative in a direction, by this share of its diagonal
-/// (with which it is scaled to 1): what rounding to six digits leaves.
+/// Share of its diagonal (which is scaled to 1) by which an information matrix may differ from its transpose, and be
+/// negative in a direction: the error of rounding to six digits.
 const INFORMATION_ROUNDING: f64 = 1e-5;
 
-/// Number of a vertex in the order in which they were added.
+/// Index of a vertex, in order of insertion.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct VertexId(pub(super) usize);
 
 impl VertexId {
-    /// Its place in the order of insertion.
+    /// Its position in the order of insertion.
     pub fn index(self) -> usize {
         self.0
     }
@@ -25,9 +25,9 @@ impl VertexId {
 /// A keyframe of the graph.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Vertex {
-    /// Its place in the map.
+    /// Its similarity in the map.
     pub map_from_keyframe: Sim3,
-    /// Whether it stays there.
+    /// Whether the similarity is held fixed.
     pub is_fixed: bool,
 }
 
@@ -40,34 +40,34 @@ pub struct Constraint {
     pub j: VertexId,
     /// The similarity as measured.
     pub j_from_i: Sim3,
-    /// Inverse covariance of the left increment (translation, rotation, log scale) of `j_from_i`; a direction in which
-    /// nothing was measured has 0.
+    /// Inverse covariance of the left increment (translation, rotation, log scale) of `j_from_i`; 0 in a direction that
+    /// was not measured.
     pub information: Matrix7,
-    /// What a large error counts.
+    /// Loss applied to its error.
     pub kernel: RobustKernel,
 }
 
-/// Why a graph does not take a vertex or a constraint.
+/// Why a graph rejects a vertex or a constraint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum GraphError {
-    /// The place is not a similarity.
+    /// The vertex is not a valid similarity.
     #[error("the place of vertex {0} is not finite or its scale is not positive")]
     InvalidVertex(usize),
-    /// The graph has as many vertices or constraints as it may.
+    /// The graph already has the maximum number of vertices or constraints.
     #[error("a pose graph has at most {MAX_VERTICES} vertices and {MAX_CONSTRAINTS} constraints")]
     TooLarge,
     /// A constraint names a vertex that the graph does not have, or one vertex twice.
     #[error("constraint {0} is not between two vertices of the graph")]
     InvalidEnds(usize),
-    /// The measurement is not a similarity.
+    /// The measurement is not a valid similarity.
     #[error("the measurement of constraint {0} is not finite or its scale is not positive")]
     InvalidMeasurement(usize),
-    /// The information is no inverse covariance.
+    /// The information is not an inverse covariance.
     #[error(
         "the information of constraint {0} is not finite, symmetric and positive semi-definite"
     )]
     InvalidInformation(usize),
-    /// The kernel's width is no threshold.
+    /// The kernel's threshold is invalid.
     #[error("the robust kernel of constraint {0} needs a positive, finite threshold")]
     InvalidKernel(usize),
 }
@@ -121,7 +121,7 @@ impl PoseGraph {
         if !constraint.kernel.is_valid() {
             return Err(GraphError::InvalidKernel(number));
         }
-        // The lower triangle counts from here on; the upper one is made equal.
+        // From here on only the lower triangle counts; the upper one is made equal.
         let information = (constraint.information + constraint.information.transpose()) * 0.5;
         self.constraints.push(Constraint { information, ..constraint });
         Ok(())
@@ -137,28 +137,28 @@ impl PoseGraph {
         &self.constraints
     }
 
-    /// Where a keyframe is; `None` where the id is that of another graph with more vertices.
+    /// The current similarity of a keyframe; `None` where the id belongs to another graph with more vertices.
     pub fn map_from_keyframe(&self, id: VertexId) -> Option<&Sim3> {
         self.vertices.get(id.0).map(|vertex| &vertex.map_from_keyframe)
     }
 
-    /// Places of all vertices, for the solver.
+    /// The similarities of all vertices, for the solver.
     pub(super) fn places_mut(&mut self) -> impl Iterator<Item = &mut Sim3> {
         self.vertices.iter_mut().map(|vertex| &mut vertex.map_from_keyframe)
     }
 }
 
-/// Whether a matrix is finite, symmetric and positive semi-definite, but for rounding. Metres, radians and logarithms have
-/// no common size: each direction is measured by its own diagonal element, so that units do not matter.
+/// Whether a matrix is finite, symmetric and positive semi-definite, up to rounding. Metres, radians and logarithms
+/// have no common size: each direction is scaled by its own diagonal element, so that units do not matter.
 fn is_information(matrix: &Matrix7) -> bool {
     let diagonal = matrix.diagonal();
-    // The sum of squares must be finite, too: products of the entries are made.
+    // The sum of squares must be finite, too: products of the entries are formed.
     if !(matrix.norm_squared().is_finite() && diagonal.min() >= 0.0) {
         return false;
     }
     let mut scaled = *matrix;
     for (k, &element) in diagonal.iter().enumerate() {
-        // Of a direction in which nothing was measured all is 0, and is left so.
+        // A direction that was not measured has zeros only, and stays so.
         let factor = if element > 0.0 { 1.0 / element.sqrt() } else { 1.0 };
         scaled.row_mut(k).scale_mut(factor);
         scaled.column_mut(k).scale_mut(factor);
@@ -219,8 +219,7 @@ mod tests {
         }
     }
 
-    /// Rotations and translations that a rounded correlation of `correlation` ties together, the translations in other
-    /// units.
+    /// Rotations and translations with correlation `correlation`, rounded, the translations in units of `unit`.
     fn correlated(correlation: f64, unit: f64) -> Matrix7 {
         let mut information = Matrix7::identity();
         information[(0, 4)] = correlation;
@@ -233,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_an_information_does_not_depend_on_units() {
+    fn the_check_of_an_information_does_not_depend_on_units() {
         for unit in [1e-6, 1e-3, 1.0, 1e3, 1e6] {
             assert!(is_information(&correlated(0.9, unit)), "{unit}");
             assert!(is_information(&correlated(1.0 + 1e-6, unit)), "rounded, {unit}");

@@ -3,14 +3,14 @@
 //! r = log(S_ji S_i⁻¹ S_j), with S_ji as measured and S_i = `map_from_keyframe` of i. An error of S_ji that is a left
 //! increment, S_ji = exp(ε) S_ji*, is r to first order, so that the information of that increment is the weight of r.
 //!
-//! Places move by increments from the right here, S ← S exp(δ): the same steps as exp(Ad(S) δ) S, but in the frame and
-//! the unit of the keyframe, which conditions the equations of a large map better. Results are given from the left.
+//! Vertices move by right increments, S ← S exp(δ): the same steps as exp(Ad(S) δ) S, but in the axes and unit of the
+//! keyframe, which conditions the equations of a large map better. Results are left increments.
 
 use nalgebra::SMatrix;
 
 use crate::slam::geometry::sim3::{Matrix7, Sim3, Twist7, left_jacobian_inverse};
 
-/// A residual and what a small motion of its keyframes does to it.
+/// A residual and its derivatives by small motions of its keyframes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Residual {
     /// r: translation, rotation, log scale.
@@ -21,13 +21,13 @@ pub struct Residual {
     pub d_value_d_j: Matrix7,
 }
 
-/// r for a measurement and the places of its keyframes.
+/// r for a measurement and the similarities of its keyframes.
 pub fn residual(j_from_i: &Sim3, map_from_i: &Sim3, map_from_j: &Sim3) -> Twist7 {
     (*j_from_i * (map_from_i.inverse() * *map_from_j)).log()
 }
 
-/// r with its derivatives: r(δ) = log(S_ji exp(−δ_i) S_i⁻¹ S_j exp(δ_j)) = log(exp(−Ad(S_ji) δ_i) E exp(δ_j)), and what
-/// stands to the right of E = exp(r) does what J⁻¹(−r) says.
+/// r with its derivatives: r(δ) = log(S_ji exp(−δ_i) S_i⁻¹ S_j exp(δ_j)) = log(exp(−Ad(S_ji) δ_i) E exp(δ_j)); an
+/// increment to the right of E = exp(r) acts on r through J⁻¹(−r).
 pub fn linearise(j_from_i: &Sim3, map_from_i: &Sim3, map_from_j: &Sim3) -> Residual {
     let value = residual(j_from_i, map_from_i, map_from_j);
     let left = left_jacobian_inverse(&value);

@@ -1,10 +1,10 @@
-//! Robust kernels: what a constraint with a large error counts.
+//! Robust kernels: the cost of a constraint with a large error.
 
-/// How the cost of a constraint grows with its squared error e = rᵀΛr; `threshold` is the √e up to which it counts in
-/// full, or nearly.
+/// Growth of a constraint's cost with its squared error e = rᵀΛr; `threshold` is the √e up to which it counts in full,
+/// or nearly.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum RobustKernel {
-    /// e: a constraint that is never wrong, such as that of a keyframe to the next.
+    /// e: for a constraint that is never wrong, such as that of a keyframe to the next.
     #[default]
     None,
     /// Huber: 2k√e − k² beyond k. Convex; a false constraint keeps pulling.
@@ -18,24 +18,24 @@ pub enum RobustKernel {
         threshold: f64,
     },
     /// Dynamic covariance scaling (Agarwal, Tipaldi, Spinello, Stachniss, Burgard 2013): k²(3e − k²)/(e + k²) beyond k,
-    /// which no error exceeds 3k² of. A false constraint is given up.
+    /// bounded by 3k². A false constraint is rejected.
     DynamicCovariance {
         /// k, the paper's √Φ.
         threshold: f64,
     },
 }
 
-/// What a constraint counts at an error.
+/// Cost and weight of a constraint at an error.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RobustCost {
     /// ρ(e).
     pub cost: f64,
-    /// ρ'(e): 1 in full, towards 0 where the constraint is not believed.
+    /// ρ'(e): 1 in full, towards 0 for an outlier.
     pub weight: f64,
 }
 
 impl RobustKernel {
-    /// The √e up to which a constraint counts in full; `None` where that is always.
+    /// The √e up to which a constraint counts in full; `None` if always.
     pub fn threshold(&self) -> Option<f64> {
         match *self {
             Self::None => None,
@@ -45,7 +45,7 @@ impl RobustKernel {
         }
     }
 
-    /// Whether the threshold is one; its square is used.
+    /// Whether the threshold is valid; its square is used.
     pub fn is_valid(&self) -> bool {
         self.threshold().is_none_or(|k| k > 0.0 && (k * k).is_normal())
     }

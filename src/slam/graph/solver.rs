@@ -1,4 +1,4 @@
-//! Levenberg–Marquardt on the places of a pose graph.
+//! Levenberg–Marquardt on the similarities of a pose graph.
 
 use crate::slam::geometry::sim3::{Sim3, Twist7};
 use crate::slam::graph::factorisation::Factorisation;
@@ -6,23 +6,23 @@ use crate::slam::graph::pose_graph::PoseGraph;
 use crate::slam::graph::system::{System, cost, error};
 use crate::slam::graph::{GraphParams, MAX_FACTOR_BYTES, Outcome, SolveError};
 
-/// Damping of the first step, as a share of each diagonal element: odometry is a good start.
+/// Damping of the first step, as a share of each diagonal element: odometry is a good initial value.
 const FIRST_DAMPING: f64 = 1e-5;
 /// Factors after a step that lowers the cost, and after one that does not.
 const DAMPING_DOWN: f64 = 0.1;
 const DAMPING_UP: f64 = 10.0;
-/// Least damping, of no effect but to let the next one rise; beyond the most every step vanishes.
+/// Least damping: no effect, but the next one can grow from it; above the most every step vanishes.
 const LEAST_DAMPING: f64 = 1e-12;
 const MOST_DAMPING: f64 = 1e8;
-/// The places have converged when a step would lower the cost by less than this, and by less than this share of it: a
-/// thousandth of a standard deviation in one direction lowers it by a millionth.
+/// Converged when a step would lower the cost by less than this, and by less than this share of it: a thousandth of a
+/// standard deviation in one direction lowers it by a millionth.
 const CONVERGED_DECREASE: f64 = 1e-6;
 const CONVERGED_SHARE: f64 = 1e-9;
-/// After a step that lowered the cost by no more than this share the next has no damping: by then Gauss–Newton converges,
-/// and what is left of the cost is judged without another factorisation.
+/// After a step that lowered the cost by no more than this share the next is undamped: by then Gauss–Newton converges,
+/// and the remaining decrease is judged without another factorisation.
 const NEAR_SHARE: f64 = 1e-3;
 
-/// Moves the free vertices to the least cost; `graph` is as before where there is an error.
+/// Moves the free vertices to the least cost; `graph` is unchanged on error.
 pub(super) fn solve<const D: usize>(
     graph: &mut PoseGraph,
     params: &GraphParams,
@@ -54,11 +54,11 @@ fn solve_from<const D: usize>(
             is_linearised = true;
         }
         iterations += 1;
-        // Damping hides how far it is along what is hardly determined: a long chain bends at next to no cost.
+        // Damping hides the remaining distance in weak directions: a long chain bends at next to no cost.
         let used = if is_near { 0.0 } else { damping };
         let Some(expected) = take_step(&system, &mut factorisation, used, &mut step) else {
             if is_near {
-                // The best there is, of places that are not all determined.
+                // The best available, as not all vertices are determined.
                 break;
             }
             damping *= DAMPING_UP;
@@ -90,7 +90,7 @@ fn solve_from<const D: usize>(
     Ok(Outcome { initial_cost, cost: current, chi2, iterations, is_converged })
 }
 
-/// Solves for the step; by how much it would lower the cost, `None` where the equations are singular.
+/// Solves for the step and returns the expected decrease of the cost, `None` where the equations are singular.
 fn take_step<const D: usize>(
     system: &System<D>,
     factorisation: &mut Factorisation<D>,
@@ -106,7 +106,7 @@ fn take_step<const D: usize>(
     Some(expected_decrease(system, step, damping))
 }
 
-/// What the linear equations promise: −2gᵀδ − δᵀHδ with (H + μ diag H) δ = −g.
+/// The decrease predicted by the linear equations: −2gᵀδ − δᵀHδ with (H + μ diag H) δ = −g.
 fn expected_decrease<const D: usize>(system: &System<D>, step: &[f64], damping: f64) -> f64 {
     let slope: f64 = system.gradient.iter().zip(step).map(|(g, d)| g * d).sum();
     let damped = |(node, step): (usize, &[f64])| -> f64 {
@@ -116,7 +116,7 @@ fn expected_decrease<const D: usize>(system: &System<D>, step: &[f64], damping: 
     damping * step.chunks_exact(D).enumerate().map(damped).sum::<f64>() - slope
 }
 
-/// Where the step takes the places.
+/// Applies the step to the vertices.
 fn place_after<const D: usize>(
     places: &[Sim3],
     system: &System<D>,
@@ -150,10 +150,10 @@ mod tests {
         let (j_from_i, kernel) = (Sim3::identity(), RobustKernel::None);
         let information = Matrix7::identity();
         graph.add_constraint(Constraint { i, j, j_from_i, information, kernel }).unwrap();
-        // So much that the first step promises nothing.
+        // So much damping that the first step promises nothing.
         let outcome = solve_from::<7>(&mut graph, &GraphParams::default(), MOST_DAMPING).unwrap();
         assert!(outcome.is_converged && outcome.cost < 1e-12, "{outcome:?}");
-        // Short of it that is not said.
+        // Short of the optimum it does not report convergence.
         let mut short = graph.clone();
         short.places_mut().for_each(|place| *place = Sim3::exp(&off) * *place);
         let params = GraphParams { max_iterations: 1, ..GraphParams::default() };

@@ -1,4 +1,4 @@
-//! The normal equations of a pose graph at its places.
+//! The normal equations of a pose graph at its current estimate.
 
 use std::collections::BTreeMap;
 
@@ -12,20 +12,20 @@ use crate::slam::graph::{MAX_FACTOR_BYTES, SolveError};
 /// H and g of Σ ρ(rᵀΛr) over the first `D` parts of the residuals: H = Σ ρ' JᵀΛJ, g = Σ ρ' JᵀΛr.
 #[derive(Debug, Clone)]
 pub(super) struct System<const D: usize> {
-    /// By vertex: its number among those that are free.
+    /// By vertex: its index among the free ones.
     pub node_of: Vec<Option<usize>>,
-    /// Blocks of H off the diagonal: (row, column), the later node first.
+    /// Off-diagonal blocks of H: (row, column), the later node first.
     pub pairs: Vec<(usize, usize)>,
     /// H: the diagonal blocks, then those of `pairs`.
     pub blocks: Vec<SMatrix<f64, D, D>>,
     /// g.
     pub gradient: Vec<f64>,
-    /// By constraint: the block off the diagonal.
+    /// By constraint: its off-diagonal block.
     block_of: Vec<Option<usize>>,
 }
 
 impl<const D: usize> System<D> {
-    /// The structure of the equations; their blocks may take [`MAX_FACTOR_BYTES`].
+    /// Sets up the structure of the equations; their blocks may take [`MAX_FACTOR_BYTES`].
     pub fn new(graph: &PoseGraph) -> Result<Self, SolveError> {
         let mut free = 0..;
         let number = |is_fixed: bool, free: &mut std::ops::RangeFrom<usize>| {

@@ -1,4 +1,4 @@
-//! A pose graph as a whole, on loops that are known exactly.
+//! Tests of whole pose graphs, on loops with exact truth.
 
 use nalgebra::Vector6;
 
@@ -21,7 +21,7 @@ fn noise(random: &mut Random, share: f64) -> Twist7 {
     Twist7::from(DEVIATIONS.map(|deviation| share * deviation * random.normal()))
 }
 
-/// A circle of keyframes that look outwards, each with a unit of its own.
+/// A circle of keyframes that face outwards, each with its own unit.
 fn circle(number: usize) -> Vec<Sim3> {
     (0..number)
         .map(|k| {
@@ -37,7 +37,7 @@ fn measured(truth: &[Sim3], i: usize, j: usize, error: &Twist7) -> Sim3 {
     Sim3::exp(error) * (truth[j].inverse() * truth[i])
 }
 
-/// A graph of a chain, started from its own measurements, with loops (i, j, measurement); the first is fixed.
+/// The graph of a chain, started from its own measurements, with loops (i, j, measurement); the first is fixed.
 fn graph_of(
     truth: &[Sim3],
     chain: impl Fn(usize) -> Sim3,
@@ -73,7 +73,7 @@ fn worst(graph: &PoseGraph, truth: &[Sim3]) -> f64 {
 #[test]
 fn a_loop_whose_scale_drifts_is_closed_exactly() {
     let truth = circle(60);
-    // The start drifts by a factor of two in scale; every measurement is exact, so that the loops undo it.
+    // The start drifts by a factor of two in scale; every measurement is exact, so the loops undo it.
     let none = Twist7::zeros();
     let exact = |k: usize| measured(&truth, k - 1, k, &none);
     let loops = [(59, 0, measured(&truth, 59, 0, &none))];
@@ -91,9 +91,9 @@ fn a_loop_whose_scale_drifts_is_closed_exactly() {
 }
 
 #[test]
-fn a_loop_shares_the_drift_among_all() {
+fn a_loop_distributes_the_drift_over_all_keyframes() {
     let truth = circle(60);
-    // The scale of every step is wrong by 1 %, which the one loop shows.
+    // The scale of every step is wrong by 1 %, which the one loop reveals.
     let drift = Twist7::from([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01]);
     let drifting = |k: usize| measured(&truth, k - 1, k, &drift);
     let loops = [(59, 0, measured(&truth, 59, 0, &Twist7::zeros()))];
@@ -107,7 +107,7 @@ fn a_loop_shares_the_drift_among_all() {
 /// √e up to which a loop counts in full: of 7 degrees of freedom 99 % lie within (χ²₇ is 18.5 there).
 const THRESHOLD: f64 = 4.3;
 
-/// Worst error of a place, with 8 true and `num_false` false loops.
+/// Worst error of a vertex, with 8 true and `num_false` false loops.
 fn with_false_loops(kernel: RobustKernel, num_false: usize, seed: u64) -> f64 {
     let truth = circle(100);
     let mut random = Random::new(seed);
@@ -117,7 +117,7 @@ fn with_false_loops(kernel: RobustKernel, num_false: usize, seed: u64) -> f64 {
     for _ in 0..num_false {
         let i = (random.uniform() * 45.0) as usize;
         let j = i + 20 + (random.uniform() * 30.0) as usize;
-        // Two rooms alike: nothing in the measurement itself tells.
+        // Two rooms that look alike: nothing in the measurement itself reveals it.
         loops.push((i, j, Sim3::exp(&noise(&mut random, 5.0))));
     }
     let chain = |k: usize| measured(&truth, k - 1, k, &errors[k]);
@@ -126,7 +126,7 @@ fn with_false_loops(kernel: RobustKernel, num_false: usize, seed: u64) -> f64 {
     worst(&graph, &truth)
 }
 
-/// Median and worst over nine noises.
+/// Median and worst over nine noise seeds.
 fn over_seeds(kernel: RobustKernel, num_false: usize) -> (f64, f64) {
     let mut errors: Vec<f64> = (0..9).map(|s| with_false_loops(kernel, num_false, s)).collect();
     errors.sort_by(f64::total_cmp);
@@ -136,19 +136,19 @@ fn over_seeds(kernel: RobustKernel, num_false: usize) -> (f64, f64) {
 #[test]
 fn false_loops_among_true_ones_are_rejected() {
     let (middle, most) = over_seeds(RobustKernel::None, 0);
-    // As many false ones as true ones at last.
+    // In the last case there are as many false ones as true ones.
     for num_false in [0, 2, 4, 8] {
         let kernel = RobustKernel::DynamicCovariance { threshold: THRESHOLD };
         let found = over_seeds(kernel, num_false);
         assert!(found.0 < 1.05 * middle && found.1 < 1.05 * most, "{num_false}: {found:?}");
     }
-    // They do harm, then; and a convex kernel does not keep them out.
+    // Without it they do harm, and a convex kernel does not reject them.
     for kernel in [RobustKernel::None, RobustKernel::Huber { threshold: THRESHOLD }] {
         assert!(over_seeds(kernel, 4).0 > 5.0 * middle, "{kernel:?}");
     }
 }
 
-/// Mean of δᵀΣ⁻¹δ over repetitions, for the last place and for one place in another.
+/// Mean of δᵀΣ⁻¹δ over repetitions, for the last vertex and for one relative to another.
 fn normalized_errors() -> (f64, f64) {
     let truth = circle(30);
     let mut random = Random::new(5);
@@ -180,7 +180,7 @@ fn normalized_errors() -> (f64, f64) {
 }
 
 #[test]
-fn errors_are_as_large_as_their_covariance_says() {
+fn errors_are_as_large_as_their_covariances() {
     let (absolute, relative) = normalized_errors();
     // χ²₇ has mean 7, and a mean of 300 a standard deviation of 0.22.
     for found in [absolute, relative] {
@@ -189,7 +189,7 @@ fn errors_are_as_large_as_their_covariance_says() {
 }
 
 #[test]
-fn fixed_vertices_stay_and_what_is_not_connected_is_an_error() {
+fn fixed_vertices_stay_and_unconnected_ones_are_an_error() {
     let truth = circle(10);
     let chain = |k: usize| measured(&truth, k - 1, k, &Twist7::zeros());
     let (mut graph, ids) = graph_of(&truth, chain, &[], RobustKernel::None);
@@ -214,7 +214,7 @@ fn fixed_vertices_stay_and_what_is_not_connected_is_an_error() {
     assert_eq!(optimise(&mut graph, &params), Err(SolveError::Disconnected(alone)));
     assert_eq!(graph, before);
 
-    // A constraint that says nothing connects, but determines nothing.
+    // A constraint without information connects, but determines nothing.
     graph.add_constraint(Constraint { j: alone, information: Matrix7::zeros(), ..ends }).unwrap();
     let before = graph.clone();
     assert_eq!(optimise(&mut graph, &params), Err(SolveError::Singular));
@@ -224,7 +224,7 @@ fn fixed_vertices_stay_and_what_is_not_connected_is_an_error() {
 
 #[test]
 fn a_graph_whose_factor_would_be_too_large_is_refused() {
-    // Connected at random its factor is dense: half of 5 000² blocks are 5 GB.
+    // With random connections its factor is dense: half of 5 000² blocks are 5 GB.
     const KEYFRAMES: usize = 5000;
     let mut random = Random::new(1);
     let mut graph = PoseGraph::new();
@@ -246,7 +246,7 @@ fn a_graph_whose_factor_would_be_too_large_is_refused() {
 }
 
 #[test]
-fn nothing_to_do_is_done_at_once() {
+fn a_graph_without_errors_converges_at_once() {
     let mut graph = PoseGraph::new();
     let outcome = optimise(&mut graph, &GraphParams::default()).unwrap();
     assert!(outcome.is_converged && outcome.cost == 0.0);

@@ -1,9 +1,9 @@
-//! What the keyframes say of each other without loops: each one's place against those that it was estimated with.
+//! Constraints between keyframes without loops: the pose of each relative to those it was estimated with.
 //!
-//! The estimate gives the covariance P of the errors (ξ, λ) of a place against those that held it
-//! (`slam::place_covariance`). With S = `map_from_keyframe` of the newer keyframe the left increment of
-//! `newer_from_older` errs by −Ad(S⁻¹) (ξ, 0) − (0, 0, λ). Together the n links of a keyframe say what the estimate says
-//! of it, so that each has n times the covariance.
+//! The estimate gives the covariance P of the errors (ξ, λ) of a pose relative to those held
+//! (`slam::place_covariance`). With S = `map_from_keyframe` of the newer keyframe the error of the left increment of
+//! `newer_from_older` is −Ad(S⁻¹) (ξ, 0) − (0, 0, λ). The n links of a keyframe together carry the information of its
+//! estimate, so each has n times the covariance.
 
 use std::collections::BTreeMap;
 
@@ -17,9 +17,9 @@ use crate::slam::loops::Loops;
 use crate::slam::loops::known::Link;
 use crate::slam::place_covariance::PlaceCovariance;
 
-/// Standard deviations of a link: no less than this, whatever an estimate claims, and that of a keyframe that was not
-/// estimated: of translation in mean depths, of rotation in radians, of ln s. The least are an eighth of a pixel at f = 250
-/// and what is left of a scale that a thousand points hold; the others a step to the next keyframe by the tracker alone.
+/// Standard deviations of a link (translation in mean depths, rotation in radians, ln s): the least, whatever an
+/// estimate claims, and those without an estimate. The least are an eighth of a pixel at f = 250 and the uncertainty of
+/// a scale that a thousand points hold; the others those of a step to the next keyframe by the tracker alone.
 const LEAST: [f64; 3] = [0.0005, 0.0005, 0.001];
 const UNESTIMATED: [f64; 3] = [0.03, 0.02, 0.05];
 
@@ -27,14 +27,14 @@ const UNESTIMATED: [f64; 3] = [0.03, 0.02, 0.05];
 pub(super) struct Chain {
     pub(super) graph: PoseGraph,
     vertices: BTreeMap<u64, VertexId>,
-    /// Ids in the order of the vertices.
+    /// Ids in order of the vertices.
     pub(super) ids: Vec<u64>,
-    /// Number of its links that are not loops.
+    /// Number of its constraints that are not loops.
     num_links: usize,
 }
 
 impl Chain {
-    /// Of the epoch's nodes, in the order of their ids, with the loops that were found; `None` where a number is broken.
+    /// The chain of an epoch's nodes, in order of their ids, with its loops; `None` where a value is invalid.
     pub(super) fn new(loops: &Loops, nodes: &[Keyframe], epoch: u32) -> Option<Self> {
         let of_epoch: Vec<&Keyframe> = nodes.iter().filter(|node| node.epoch == epoch).collect();
         let mut graph = PoseGraph::new();
@@ -74,7 +74,7 @@ impl Chain {
         Some(chain)
     }
 
-    /// Adds a loop; one of keyframes that the epoch does not have is left out.
+    /// Adds a loop; one of keyframes outside the epoch is ignored.
     pub(super) fn add_loop(&mut self, link: &Link) {
         let _ = self.add(link.i, link.j, link.j_from_i, &link.covariance);
     }
@@ -86,7 +86,7 @@ impl Chain {
         self.graph.add_constraint(Constraint { i, j, j_from_i, information, kernel }).ok()
     }
 
-    /// What links and loops say of any two keyframes; `None` where the graph cannot be solved.
+    /// Predicts the similarity of any two keyframes from links and loops; `None` where the graph cannot be solved.
     pub(super) fn into_predictions(self) -> Option<Predictions> {
         let marginals = Marginals::new(&self.graph, &GraphParams::default()).ok()?;
         Some(Predictions { chain: self, marginals })
@@ -98,14 +98,14 @@ impl Chain {
     }
 }
 
-/// What the keyframes of an epoch say of each other.
+/// Predicted similarities between the keyframes of an epoch.
 pub(super) struct Predictions {
     chain: Chain,
     marginals: Marginals,
 }
 
 impl Predictions {
-    /// `j_from_i` by the places, and its covariance by links and loops.
+    /// `j_from_i` from the current poses, and its covariance from links and loops.
     pub(super) fn of(&mut self, i: u64, j: u64) -> Option<(Sim3, Matrix7)> {
         let Chain { graph, vertices, .. } = &self.chain;
         let (i, j) = (*vertices.get(&i)?, *vertices.get(&j)?);
@@ -115,7 +115,7 @@ impl Predictions {
     }
 }
 
-/// Covariance of the left increment of `newer_from_older` by that of the newer one's place.
+/// Covariance of the left increment of `newer_from_older` from that of the newer one's pose.
 pub(super) fn link_covariance(
     map_from_newer: &Sim3,
     place: Option<&PlaceCovariance>,

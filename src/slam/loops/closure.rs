@@ -1,4 +1,4 @@
-//! What a loop does to the map: the pose graph of the epoch is solved with it, or two epochs become one.
+//! Applies a loop: the pose graph of the epoch is solved with it, or two epochs become one.
 
 use std::sync::Arc;
 
@@ -11,19 +11,19 @@ use crate::slam::loops::search::LARGEST_CHI2;
 use crate::slam::loops::{Job, Loops, SearchFate};
 use crate::slam::map::EpochJoin;
 
-/// How the map is to be moved.
+/// The change of the map by a loop.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Closure {
-    /// The epoch that is moved, which need not be the active one.
+    /// The epoch to be moved, not necessarily the active one.
     pub epoch: u32,
-    /// Where each keyframe goes, in the order of their ids: what its place is multiplied by from the left.
+    /// Motion of each keyframe, in order of their ids: its pose is multiplied by this from the left.
     pub moves: Vec<(u64, Sim3)>,
     /// An epoch that becomes part of another.
     pub join: Option<EpochJoin>,
 }
 
 impl Closure {
-    /// The move of a keyframe: its own, or of one of the epoch that came later that of the last before it.
+    /// The motion of a keyframe: its own, or for a later one of the epoch that of the last before it.
     pub fn of(&self, keyframe_id: u64, epoch: u32) -> Option<&Sim3> {
         if epoch != self.epoch {
             return None;
@@ -34,7 +34,7 @@ impl Closure {
 }
 
 impl Loops {
-    /// A loop is confirmed: it holds from now on, unless it contradicts those before.
+    /// Adds a confirmed loop as a constraint, unless it contradicts the earlier ones.
     pub(super) fn close(&mut self, job: &Job, confirmed: &[Link]) -> SearchFate {
         let before = self.known.links.len();
         Arc::make_mut(&mut self.known).links.extend(confirmed);
@@ -45,7 +45,7 @@ impl Loops {
         fate
     }
 
-    /// What the newest loops do to the map: a pair, or those that join two epochs.
+    /// Solves for the effect of the newest loops on the map: a pair, or those that join two epochs.
     pub(super) fn solve(&mut self, job: &Job, num_newest: usize) -> SearchFate {
         let links = &self.known.links;
         let first = links.len().checked_sub(num_newest).and_then(|at| links.get(at));
@@ -75,7 +75,7 @@ impl Loops {
     }
 
     fn solve_graph(&mut self, job: &Job, epoch: u32, num_newest: usize) -> SearchFate {
-        /// χ²₇ that one of ten thousand true loops exceeds: with what holds the rest there is a false one.
+        /// χ²₇ that one of ten thousand true loops exceeds: together with the other constraints one must be false.
         const CONTRADICTED_CHI2: f64 = 29.9;
         let Some(mut chain) = Chain::new(self, &job.nodes, epoch) else {
             return SearchFate::Inconsistent;

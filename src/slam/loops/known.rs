@@ -1,4 +1,4 @@
-//! What the search for loops knows of a map, as it is kept with the map.
+//! State of the search for loops of a map, stored with the map.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -19,16 +19,16 @@ pub struct Link {
     pub covariance: Matrix7,
 }
 
-/// Loops of a map, and what its keyframes say of each other without them.
+/// Loops of a map, and the keyframes that each was estimated against.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct KnownLoops {
-    /// Loops that hold, in the order in which they were found.
+    /// Accepted loops, in the order in which they were found.
     pub links: Vec<Link>,
-    /// By keyframe the older ones that its place was estimated against.
+    /// By keyframe: the older ones that its pose was estimated against.
     pub held_by: BTreeMap<u64, Vec<u64>>,
-    /// Keyframes that nothing connects with the one before: the first of epochs that were joined to others.
+    /// Keyframes without a link to the one before: the first of epochs that were joined to others.
     pub beginnings: BTreeSet<u64>,
-    /// Keyframes up to this one have been searched.
+    /// All keyframes up to this one have been searched.
     pub searched_to: Option<u64>,
 }
 
@@ -40,17 +40,17 @@ impl Link {
 }
 
 impl KnownLoops {
-    /// Whether nothing is known.
+    /// Whether nothing is stored.
     pub fn is_empty(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Keyframes that a loop is measured between.
+    /// Keyframes at the ends of loops.
     pub fn keyframe_ids(&self) -> BTreeSet<u64> {
         self.links.iter().flat_map(|link| [link.i, link.j]).collect()
     }
 
-    /// Of two maps in one, where the ids of the second are so much larger than they were.
+    /// Merges the loops of two maps, with `ids` added to the ids of the second.
     pub fn with(mut self, second: &Self, ids: u64) -> Self {
         let moved = |id: &u64| id.saturating_add(ids);
         let links = second.links.iter().map(|of| Link { i: moved(&of.i), j: moved(&of.j), ..*of });
@@ -62,7 +62,7 @@ impl KnownLoops {
         self
     }
 
-    /// Of the keyframes from an id on, whose ids are smaller by as much.
+    /// The loops of the keyframes from id `ids` on, with `ids` subtracted from theirs.
     pub fn from(&self, ids: u64) -> Self {
         let moved = |id: u64| id.checked_sub(ids);
         let link = |of: &Link| Some(Link { i: moved(of.i)?, j: moved(of.j)?, ..*of });
@@ -77,7 +77,7 @@ impl KnownLoops {
         }
     }
 
-    /// By keyframe those that it was estimated with, older and newer, as far as they held each other.
+    /// By keyframe: those that it was estimated with, older and newer, as far as they held each other.
     pub(super) fn partners(&self) -> BTreeMap<u64, BTreeSet<u64>> {
         let mut partners: BTreeMap<u64, BTreeSet<u64>> = BTreeMap::new();
         for (&one, by) in &self.held_by {
@@ -89,8 +89,8 @@ impl KnownLoops {
         partners
     }
 
-    /// The newest of some keyframes that cannot be searched any more: it was, or nobody knows what it was estimated with,
-    /// so that its neighbours would be taken for loops.
+    /// The newest keyframe that cannot be searched any more: it was searched already, or it has no record of what it
+    /// was estimated with, so its neighbours would be taken for loops.
     pub(super) fn last_searched(&self, keyframes: &[Keyframe]) -> Option<u64> {
         let is_unknown = |id: &u64| !self.held_by.contains_key(id);
         let unknown = keyframes.iter().map(|of| of.keyframe_id).filter(is_unknown).max();

@@ -1,4 +1,4 @@
-//! Which keyframes look like one, wherever they are thought to be.
+//! Finds keyframes that look like a given one, wherever the map places them.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -6,21 +6,21 @@ use std::sync::Arc;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::places::{Description, PlaceCandidate, PlaceIndex};
 
-/// What keyframes look like.
+/// Appearance of the keyframes.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Likeness {
     index: PlaceIndex,
-    /// The newest that was offered.
+    /// The newest one offered.
     offered_to: Option<u64>,
-    /// To be entered where there is time: in the thread of the search.
+    /// To be inserted when there is time: in the thread of the search.
     offered: Vec<(u64, Arc<Description>)>,
-    /// Of those that are still to be looked for.
+    /// Descriptions of the keyframes still to be searched.
     waiting: BTreeMap<u64, Arc<Description>>,
 }
 
 impl Likeness {
-    /// Takes the descriptions of keyframes that are new; one whose image is too small to look like anything has none. From
-    /// which place on they are new.
+    /// Takes the descriptions of new keyframes; one whose image is too small has none. Returns the index of the first
+    /// new one.
     pub(super) fn offer(&mut self, keyframes: &[Keyframe]) -> usize {
         let new = keyframes.partition_point(|of| Some(of.keyframe_id) <= self.offered_to);
         for keyframe in &keyframes[new..] {
@@ -31,7 +31,7 @@ impl Likeness {
         new
     }
 
-    /// Enters what was offered, and takes out what is not `known` any more, which is in order.
+    /// Inserts the offered descriptions, and removes those no longer in `known`, which is in order.
     pub(super) fn enter(&mut self, known: &[u64]) {
         let is_gone = |id: &u64| known.binary_search(id).is_err();
         let gone: Vec<u64> = self.index.keyframe_ids().filter(is_gone).collect();
@@ -45,13 +45,13 @@ impl Likeness {
         }
     }
 
-    /// A keyframe and those before it will not be looked for any more.
+    /// Forgets a keyframe and those before it, as they will not be searched any more.
     pub(super) fn forget(&mut self, keyframe_id: u64) {
         self.waiting = self.waiting.split_off(&keyframe_id.saturating_add(1));
     }
 
-    /// Of `among`, which is in order, those that look most like a keyframe, with at least so many features in common, the
-    /// most alike first; no two beside each other in `among`, which would show the same.
+    /// The keyframes of `among`, which is in order, that look most like a given one, with at least `least` features in
+    /// common, the most similar first; no two of them adjacent in `among`, as those would show the same.
     pub(super) fn candidates(
         &self,
         of: u64,
@@ -59,11 +59,11 @@ impl Likeness {
         most: usize,
         least: f32,
     ) -> Vec<PlaceCandidate> {
-        /// Places in the list within which two show the same.
+        /// Positions in the list within which two show the same.
         const BESIDE: usize = 3;
         let Some(description) = self.waiting.get(&of) else { return Vec::new() };
         let place = |id: u64| among.binary_search(&id).ok();
-        // As many again as can be beside one.
+        // Enough to drop all that are next to a chosen one.
         let most_found = most * (2 * BESIDE + 1);
         let found = self.index.candidates(description, most_found, |id| place(id).is_none());
         let mut chosen: Vec<(usize, PlaceCandidate)> = Vec::new();
@@ -87,7 +87,7 @@ mod tests {
     use nalgebra::Vector6;
 
     #[test]
-    fn a_view_is_found_with_the_rotation_that_it_has() {
+    fn a_view_is_found_with_its_rotation() {
         let scene = Scene::new(3);
         let pixels = |pose: &SE3| scene.render(&CAMERA, pose).noisy(2.0, 1);
         let mut likeness = Likeness::default();

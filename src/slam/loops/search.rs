@@ -1,5 +1,5 @@
-//! Whether two keyframes see the same place: measured, judged by the drift that the map can have, and confirmed by another
-//! pair.
+//! Decides whether two keyframes see the same place: measured, checked against the possible drift of the map, and
+//! confirmed by another pair.
 
 use crate::slam::geometry::sim3::{Matrix7, Sim3, Twist7};
 use crate::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Refusal, Start};
@@ -7,11 +7,11 @@ use crate::slam::loops::chain::{Chain, link_covariance};
 use crate::slam::loops::known::Link;
 use crate::slam::loops::{Job, Loops, Pair, Plan, SearchFate, Stage, confirmations};
 
-/// χ²₇ at 99 %, within which two things that were measured agree.
+/// χ²₇ at 99 %, up to which two measurements agree.
 pub(super) const LARGEST_CHI2: f64 = 18.5;
 
 impl Loops {
-    /// Measures the candidates of a keyframe, and plans the confirmation of the first that may be its place.
+    /// Measures the candidates of a keyframe, and plans the confirmation of the first plausible one.
     pub(super) fn search(&mut self, job: &Job) -> (u32, SearchFate) {
         let solver = ConstraintSolver::new(ConstraintParams::default());
         let mut refusal = None;
@@ -26,7 +26,7 @@ impl Loops {
             let (Some(other), Some(at)) = (job.keyframe(pair.j), job.node(pair.j)) else {
                 continue;
             };
-            // Two epochs may lie anywhere.
+            // Two epochs may have any relative pose.
             let is_one_epoch = at.epoch == node.epoch;
             let predicted = predictions.as_mut().and_then(|of| of.of(pair.i, pair.j));
             let predicted = predicted.filter(|_| is_one_epoch);
@@ -65,7 +65,7 @@ impl Loops {
         (compared, against_drift.unwrap_or(refused))
     }
 
-    /// Measures pairs beside a loop; one must say the same, of a loop between two epochs two.
+    /// Measures pairs next to a loop; one must confirm it, two for a loop between epochs.
     pub(super) fn confirm(&mut self, job: &Job, link: &Link) -> (u32, SearchFate) {
         let solver = ConstraintSolver::new(ConstraintParams::default());
         let (Some(i), Some(j)) = (job.node(link.i), job.node(link.j)) else {
@@ -94,7 +94,7 @@ impl Loops {
         (compared, SearchFate::Unconfirmed)
     }
 
-    /// Whether one pair says of the map what another beside it says.
+    /// Whether two neighbouring pairs agree about the map.
     fn agrees(&self, job: &Job, link: &Link, confirmation: &Link) -> bool {
         let place = |id| job.node(id).map(|node| node.map_from_keyframe);
         let (Some(i), Some(j), Some(near_i), Some(near_j)) =
@@ -102,7 +102,7 @@ impl Loops {
         else {
             return false;
         };
-        // near_j_from_near_i by the loop and what lies beside it.
+        // near_j_from_near_i through the loop and the links next to it.
         let (near_j_from_j, i_from_near_i) = (near_j.inverse() * j, i.inverse() * near_i);
         let expected = near_j_from_j * link.j_from_i * i_from_near_i;
         let along = |by: &Sim3, covariance: &Matrix7| {
@@ -126,13 +126,13 @@ impl Loops {
     }
 }
 
-/// χ² along the line between two keyframes by which the map would at least have drifted, whatever is measured between them
-/// and accepted: they are near each other then. What exceeds the limit need not be measured.
+/// Least χ² of any measurement between two keyframes that would be accepted: it would place them near each other, so
+/// the map would have drifted along the line between them. Beyond the limit nothing need be measured.
 fn least_chi2(expected: &Sim3, covariance: &Matrix7) -> f64 {
-    /// Distance within which all that is accepted lies, in units of a keyframe: one mean depth, which is its unit at first.
+    /// Largest distance of an accepted measurement, in units of a keyframe: one mean depth, which is its initial unit.
     const REACH: f64 = 1.5;
-    /// Standard deviation of a measurement, of translation in units and of ln s: five times what is usual, and half of what
-    /// is accepted.
+    /// Standard deviation of a measurement, of translation in units and of ln s: five times the usual one, and half of
+    /// what is accepted.
     const LARGEST_DEVIATION: f64 = 0.05;
     let distance = expected.rigid.translation.norm();
     if distance <= REACH {
@@ -145,14 +145,14 @@ fn least_chi2(expected: &Sim3, covariance: &Matrix7) -> f64 {
     (distance - REACH).powi(2) / (along.dot(&(covariance * along)) + of_measurement)
 }
 
-/// How far a similarity is from where it was expected, by the covariance of the left increment.
+/// Squared distance of a similarity from the expected one, normalised by the covariance of the left increment.
 fn chi2(expected: &Sim3, found: &Sim3, covariance: &Matrix7) -> f64 {
     let difference = (*found * expected.inverse()).log();
     let whitening = covariance.cholesky();
     whitening.map_or(f64::NAN, |whitening| difference.dot(&whitening.solve(&difference)))
 }
 
-/// Pairs of a neighbour of one keyframe with a neighbour of the other: no image is in both.
+/// Pairs of a neighbour of one keyframe with a neighbour of the other: they share no image with the loop.
 fn confirming(job: &Job, link: &Link) -> Vec<Pair> {
     let beside = |id: u64| {
         let place = job.nodes.binary_search_by_key(&id, |node| node.keyframe_id).unwrap_or(0);
@@ -176,7 +176,7 @@ fn confirming(job: &Job, link: &Link) -> Vec<Pair> {
             * one.map_from_keyframe;
         pairs.push(Pair { i: one.keyframe_id, j: other.keyframe_id, j_from_i });
     }
-    // Those that look the same way first: the smallest turn and distance between them.
+    // Pairs with the most similar views first: the smallest rotation and distance between them.
     let apart = |pair: &Pair| pair.j_from_i.log().norm();
     pairs.sort_by(|one, other| apart(one).total_cmp(&apart(other)));
     pairs

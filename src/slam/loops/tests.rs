@@ -1,4 +1,4 @@
-//! Loops of rendered rooms: true ones close, others do not.
+//! Loops of rendered rooms: true ones are closed, others are not.
 
 use super::*;
 use crate::slam::geometry::se3::SE3;
@@ -14,14 +14,14 @@ use nalgebra::Vector6;
 /// Length of the keyframes' units, metres.
 const UNIT: f64 = 2.5;
 
-/// Where a camera stands that is turned by so many degrees about the vertical.
+/// The pose of a camera that is rotated by so many degrees about the vertical.
 fn turned(at: [f64; 3], degrees: f64) -> SE3 {
     let mut pose = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, degrees.to_radians(), 0.0));
     pose.translation = at.into();
     pose
 }
 
-/// A camera that turns all around in twelve steps and once more sees what it saw at first: true places.
+/// A camera that turns full circle in twelve steps and then repeats its first views: true poses.
 fn round() -> Vec<SE3> {
     let at = |k: usize| {
         let wander = 0.05 * k as f64;
@@ -37,8 +37,8 @@ struct Course {
 }
 
 impl Course {
-    /// Of images and true places in the map's unit, metres. Each step errs by `drift` standard deviations of what is
-    /// claimed: `claimed` of translation, metres, of rotation and of ln s.
+    /// From images and true poses in the map's unit, metres. Each step errs by `drift` standard deviations of the
+    /// reported ones: `claimed` of translation, metres, of rotation and of ln s.
     fn new(views: Vec<(Keyframe, SE3)>, claimed: f64, drift: f64, seed: u64) -> Self {
         let mut random = Random::new(seed);
         let mut map = Map::default();
@@ -48,7 +48,7 @@ impl Course {
         for (id, (image, place)) in (0u64..).zip(views) {
             let at = place.translation;
             let variance = if id == 0 { 0.0 } else { claimed * claimed };
-            // Errors of the step turn about the keyframe: as left increments of the map about its origin.
+            // Rotation errors of a step are about the keyframe; as left increments of the map, about its origin.
             let about = SE3 { translation: at, ..SE3::identity() }.adjoint();
             let mut covariance = PlaceMatrix::identity() * variance;
             let of_pose = about * about.transpose() * variance;
@@ -77,7 +77,7 @@ impl Course {
         Self::new(views(scene, places), claimed, drift, seed)
     }
 
-    /// Looks for all keyframes; applies what comes of it.
+    /// Searches all keyframes and applies the results.
     fn run(&mut self) -> Vec<SearchReport> {
         let mut reports = Vec::new();
         loop {
@@ -101,7 +101,7 @@ impl Course {
         }
     }
 
-    /// Distance of a keyframe from where it stands against the first one, metres.
+    /// Error of a keyframe's position relative to the first one, metres.
     fn error(&self, index: usize, places: &[SE3]) -> f64 {
         let found = self.map.keyframes[0].map_from_keyframe.inverse()
             * self.map.keyframes[index].map_from_keyframe;
@@ -126,7 +126,7 @@ fn moves_nothing(reports: &[SearchReport]) -> bool {
 }
 
 #[test]
-fn a_loop_takes_the_drift_out_of_the_map() {
+fn a_loop_removes_the_drift_from_the_map() {
     let places = round();
     for seed in 0..3 {
         let mut course = Course::of(&Scene::new(seed), &places, 0.02, 1.0, seed);
@@ -135,7 +135,7 @@ fn a_loop_takes_the_drift_out_of_the_map() {
         assert!(count(&reports, |fate| *fate == SearchFate::Closed) > 0, "{reports:?}");
         let after = course.error(13, &places);
         assert!(after < 0.05 && after < 0.5 * before, "{seed}: {before} {after} {reports:?}");
-        // Far from both ends half of it is gone at most, and nothing is torn.
+        // Far from both ends at most half of it is gone, and nothing is torn.
         for pair in course.map.keyframes.windows(2) {
             let step = pair[0].map_from_keyframe.inverse() * pair[1].map_from_keyframe;
             assert!((step.scale - 1.0).abs() < 0.1 && step.rigid.translation.norm() < 0.2);
@@ -144,7 +144,7 @@ fn a_loop_takes_the_drift_out_of_the_map() {
 }
 
 #[test]
-fn a_map_that_has_its_loop_stays_as_it_is() {
+fn a_map_that_agrees_with_its_loop_stays_unchanged() {
     let places = round();
     let mut course = Course::of(&Scene::new(1), &places, 0.02, 0.0, 0);
     let before: Vec<Sim3> = course.map.keyframes.iter().map(|k| k.map_from_keyframe).collect();
@@ -156,8 +156,8 @@ fn a_map_that_has_its_loop_stays_as_it_is() {
 }
 
 #[test]
-fn a_room_that_is_exactly_alike_is_another_one_where_the_map_cannot_have_drifted_so_far() {
-    // The same images; by the chain the last ones stand six metres aside.
+fn an_identical_room_is_a_different_one_if_the_map_cannot_have_drifted_so_far() {
+    // The same images; in the chain the last ones are six metres to the side.
     let mut views = views(&Scene::new(2), &round());
     views.iter_mut().skip(9).for_each(|(_, place)| place.translation.x += 6.0);
     let mut course = Course::new(views, 0.02, 1.0, 4);
@@ -167,8 +167,8 @@ fn a_room_that_is_exactly_alike_is_another_one_where_the_map_cannot_have_drifted
 }
 
 #[test]
-fn a_view_that_its_neighbours_contradict_is_not_believed() {
-    // One image of the room that was seen at first, in the middle of another; the map may have drifted by anything.
+fn a_view_that_its_neighbours_contradict_is_rejected() {
+    // One image of the first room, in the middle of another; the map may have drifted by anything.
     let places = round();
     let mut views = views(&Scene::new(3), &places);
     let others = self::views(&Scene::new(8), &places);
@@ -184,7 +184,7 @@ fn a_view_that_its_neighbours_contradict_is_not_believed() {
 }
 
 #[test]
-fn a_corridor_that_repeats_and_a_blank_wall_close_nothing() {
+fn a_repeating_corridor_and_a_blank_wall_close_nothing() {
     let along: Vec<SE3> = (0..14).map(|k| turned([0.0, 0.0, 0.6 * f64::from(k)], 0.0)).collect();
     for claimed in [0.02, 0.1] {
         let corridor = Scene::corridor(2, 1.2);
@@ -216,7 +216,7 @@ fn two_epochs_that_see_the_same_become_one() {
         views.push((Keyframe { epoch: 1, map_from_keyframe: at, ..view }, moved));
     }
     let far = views.split_off(5);
-    // Views between which nothing is alike, so that the epochs are not beside each other in the list.
+    // Views with nothing in common, so that the epochs are not adjacent in the list.
     let between = self::views(&Scene::new(9), &round()[4..12]);
     views.extend(between);
     views.extend(far);
@@ -232,7 +232,7 @@ fn two_epochs_that_see_the_same_become_one() {
 }
 
 #[test]
-fn a_search_that_goes_on_from_what_was_kept_has_the_same_pose_graph() {
+fn a_search_that_continues_from_stored_loops_has_the_same_pose_graph() {
     let places = round();
     let mut course = Course::of(&Scene::new(0), &places, 0.02, 1.0, 0);
     course.run();
@@ -249,19 +249,19 @@ fn a_search_that_goes_on_from_what_was_kept_has_the_same_pose_graph() {
     assert_eq!(predicted(&resumed), predicted(&course.loops));
     assert_ne!(predicted(&resumed), predicted(&fresh()));
     assert_eq!(resumed.known(), &kept);
-    // What was searched is not searched again; its keyframes are found.
+    // Searched keyframes are not searched again, but can be found.
     let known: Vec<u64> = (0..15).collect();
     resumed.offer(keyframes);
     resumed.plan(&known, known.len());
     assert!(!resumed.begin(&course.map));
-    // Of what was estimated with others nobody knows nothing is searched.
+    // Keyframes without a record of what they were estimated with are not searched.
     let mut lost = fresh();
     lost.take_up(Arc::default(), keyframes);
     assert_eq!(lost.known().searched_to, Some(14));
 }
 
 #[test]
-fn a_closure_that_was_not_taken_is_made_again() {
+fn a_closure_that_was_not_applied_is_repeated() {
     let places = round();
     let mut course = Course::of(&Scene::new(0), &places, 0.02, 1.0, 0);
     let known: Vec<u64> = (0..15).collect();

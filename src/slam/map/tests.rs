@@ -1,4 +1,4 @@
-//! Memory, places and corrections of the map.
+//! Memory, poses and corrections of the map.
 
 use nalgebra::Vector6;
 
@@ -20,12 +20,12 @@ fn keyframe(keyframe_id: u64) -> Keyframe {
 }
 
 #[test]
-fn a_keyframe_holds_what_is_stated() {
+fn the_memory_of_a_keyframe_is_as_stated() {
     const NUM_PIXELS: usize = 640 * 480;
     let mut full = keyframe(0);
     full.image = vec![0; NUM_PIXELS].into();
     full.points = vec![DepthPoint::default(); MAX_KEYFRAME_POINTS];
-    // One a pixel, 16 a point.
+    // One byte per pixel, 16 per point.
     assert_eq!(depth_bytes(&full), 1_907_200);
 }
 
@@ -42,7 +42,7 @@ fn the_oldest_lose_their_depth_and_keep_their_pose() {
 }
 
 #[test]
-fn the_covariance_of_a_place_moves_with_it_or_is_what_a_correction_says() {
+fn the_covariance_of_a_pose_moves_with_it_unless_a_correction_gives_one() {
     let deviations = Vector6::new(0.1, 0.2, 0.3, 0.01, 0.02, 0.03).push(0.05);
     let matrix = PlaceMatrix::from_diagonal(&deviations.component_mul(&deviations));
     let uncertain = Keyframe { place_covariance: PlaceCovariance::bounded(&matrix), ..keyframe(1) };
@@ -63,13 +63,13 @@ fn the_covariance_of_a_place_moves_with_it_or_is_what_a_correction_says() {
     let mut joined = Map { keyframes: vec![uncertain.clone()], ..Map::default() };
     let join = EpochJoin { epoch: 0, into: 3, into_from_epoch: by };
     joined.correct(&Correction { joins: vec![join], ..Correction::default() }, 7).unwrap();
-    // Of a keyframe at the map's origin: lengths in the new unit, and about the new origin.
+    // For a keyframe at the map's origin: lengths in the new unit, and about the new origin.
     let expected = uncertain.place_covariance.transported(&by).matrix();
     assert!(expected[(3, 3)] > 1e-5 && (expected - matrix).norm() > 0.1);
     for found in [corrected(None, Some(2.5)), joined.keyframes[0].place_covariance] {
         assert!((found.matrix() - expected).norm() < 1e-9, "{}", found.matrix());
     }
-    // Its own unit alone is longer, the map's is the same.
+    // Only its own unit is longer, the map's is the same.
     let longer = corrected(None, None).matrix();
     let rigid = uncertain.place_covariance.transported(&Sim3::new(by.rigid, 1.0)).matrix();
     assert!((longer - rigid).norm() < 1e-9, "{longer}");

@@ -1,44 +1,44 @@
-//! How many matches of features agree on one arrangement: turned, scaled and shifted together.
+//! Counts the feature matches that agree on one arrangement: rotated, scaled and shifted together.
 
 use super::description::FeaturePlace;
 use super::pattern::{ORIENTATIONS, angle_rad};
 use super::scales::SCALE_STEP;
 
-/// A feature of a keyframe that looks like one of the image.
+/// A feature of a keyframe that resembles one of the image.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Match {
     pub(super) slot: u32,
-    /// Number of the image's feature.
+    /// Index of the image's feature.
     pub(super) ours: u16,
-    /// Number of the keyframe's.
+    /// Index of the keyframe's feature.
     pub(super) theirs: u16,
     pub(super) distance: u16,
 }
 
-/// Most matches that propose an arrangement, the best first.
+/// Maximum number of matches that propose an arrangement, the best first.
 const MOST_PROPOSALS: usize = 40;
-/// How far a match may be from where an arrangement has it, shares of the image's width: views of depth, from aside.
+/// Largest offset of a match from an arrangement, shares of the image's width: allows for depth seen from the side.
 const MAX_SHIFT: f32 = 0.1;
-/// Steps of the orientation and of the scale that a match may differ by.
+/// Steps of orientation and of scale by which a match may differ.
 const MAX_TURN: i32 = 3;
 const MAX_ZOOM: i32 = 2;
 
-/// How features of an image lie on a keyframe's.
+/// Mapping of an image's features to a keyframe's.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Arrangement {
-    /// Matches that agree on it.
+    /// Number of matches that agree on it.
     pub(super) agreeing: u32,
-    /// Angle by which the image is turned in its plane against the keyframe's, radians: a direction in the keyframe's image
-    /// plus this is the same in the image.
+    /// In-plane rotation of the image against the keyframe's, radians: a direction in the keyframe's image plus this is
+    /// the same in the image.
     pub(super) turn_rad: f32,
-    /// A pixel of the image, the middle of those that agree.
+    /// A pixel of the image, the mean of the features that agree.
     pub(super) ours: [f32; 2],
-    /// The keyframe's that shows the same.
+    /// The corresponding pixel of the keyframe.
     pub(super) theirs: [f32; 2],
 }
 
-/// The arrangement that most matches agree on, of one keyframe and each of another of our features, the best first; `None`
-/// without matches.
+/// The arrangement that most matches agree on, of one keyframe and each for another of our features, the best first;
+/// `None` without matches.
 pub(super) fn arrange(pairs: &[(FeaturePlace, FeaturePlace)], width: f32) -> Option<Arrangement> {
     let proposals = pairs.iter().take(MOST_PROPOSALS);
     let rated = proposals.map(|proposal| {
@@ -80,7 +80,7 @@ fn at(place: &FeaturePlace) -> [f32; 2] {
     [f32::from(place.u), f32::from(place.v)]
 }
 
-/// Whether a match agrees with what another proposes.
+/// Whether a match agrees with the arrangement proposed by another.
 fn agreement(proposal: &Pair, width: f32) -> impl Fn(&Pair) -> bool {
     let limit = (MAX_SHIFT * width) * (MAX_SHIFT * width);
     let half = ORIENTATIONS as i32 / 2;
@@ -103,7 +103,7 @@ mod tests {
     use super::*;
     use crate::slam::test_scene::Random;
 
-    /// Features of a keyframe, and the same turned by a quarter, twice as large, and moved.
+    /// Features of a keyframe, and the same rotated by 90°, twice as large, and moved.
     fn pairs(count: usize) -> Vec<(FeaturePlace, FeaturePlace)> {
         let mut random = Random::new(5);
         let mut below = |limit: f64| (limit * random.uniform()) as u16;
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_turned_and_enlarged_together_agrees() {
+    fn features_rotated_and_enlarged_together_agree() {
         let found = arrange(&pairs(30), 640.0).unwrap();
         assert_eq!(found.agreeing, 30);
         assert!((found.turn_rad - std::f32::consts::FRAC_PI_2).abs() < 1e-4, "{found:?}");
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_elsewhere_or_turned_otherwise_does_not() {
+    fn features_elsewhere_or_rotated_otherwise_do_not_agree() {
         let change = |of: &dyn Fn(usize, &mut FeaturePlace)| {
             let mut pairs = pairs(30);
             (0..10).for_each(|k| of(k, &mut pairs[k].0));

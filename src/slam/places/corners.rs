@@ -25,7 +25,7 @@ const CIRCLE: [[i32; 2]; 16] = [
 pub(super) struct Corner {
     pub(super) u: u16,
     pub(super) v: u16,
-    /// How much the circle differs, grey levels beyond the threshold, summed up.
+    /// Sum of the differences of the circle beyond the threshold, grey levels.
     pub(super) strength: u32,
 }
 
@@ -33,13 +33,13 @@ pub(super) struct Corner {
 #[derive(Debug, Clone, Default)]
 pub(super) struct CornerFinder {
     strengths: Vec<u16>,
-    /// Of the pixels of a row whether they can be corners, and room to find that out.
+    /// For the pixels of a row, whether they can be corners, and scratch for that.
     may_be: [Vec<u8>; 2],
 }
 
 impl CornerFinder {
-    /// Corners at least `margin` (3 or more) pixels from the edges, whose circle differs by more
-    /// than `threshold` grey levels, row after row, none beside a stronger one.
+    /// Finds corners at least `margin` (3 or more) pixels from the edges, whose circle differs by more than `threshold`
+    /// grey levels, row by row, none next to a stronger one.
     pub(super) fn find(
         &mut self,
         pixels: &[u8],
@@ -92,8 +92,8 @@ impl CornerFinder {
     }
 }
 
-/// Marks the pixels of a row, from the one `at`, that can be corners: any nine of the circle in a row hold one of any two
-/// that face each other.
+/// Marks the pixels of a row, from `at` on, that can be corners: any nine consecutive ones of the circle contain one of
+/// any two opposite ones.
 fn mark(
     pixels: &[u8],
     at: usize,
@@ -107,7 +107,7 @@ fn mark(
     let row = |offset: isize| &pixels[at.wrapping_add_signed(offset)..][..count];
     for (one, other) in offsets[..8].iter().zip(&offsets[8..]) {
         let facing = row(*one).iter().zip(row(*other));
-        // The darker of each two, the brightest of those, and the other way round.
+        // The minimum over all pairs of the brighter pixel, and the maximum of the darker one.
         for ((low, high), (a, b)) in low.iter_mut().zip(high.iter_mut()).zip(facing) {
             *low = (*low).min(*a.max(b));
             *high = (*high).max(*a.min(b));
@@ -120,7 +120,7 @@ fn mark(
     }
 }
 
-/// 0 where there is no corner: nine pixels of the circle in a row all brighter or all darker.
+/// 0 where there is no corner: nine consecutive pixels of the circle that are all brighter or all darker.
 #[inline(always)]
 fn strength(pixels: &[u8], at: usize, offsets: &[isize; 16], threshold: u8) -> u16 {
     let circle = offsets.map(|offset| pixels[at.wrapping_add_signed(offset)]);
@@ -136,7 +136,7 @@ fn strength(pixels: &[u8], at: usize, offsets: &[isize; 16], threshold: u8) -> u
     }
 }
 
-/// Whether nine of the sixteen, which close a circle, are not 0 in a row.
+/// Whether nine consecutive ones of the sixteen, which form a circle, are not 0.
 #[inline(always)]
 fn has_nine(around: &[u8; 16]) -> bool {
     let bits = (0..16).fold(0u32, |bits, k| bits | u32::from(around[k] != 0) << k);
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn margins_and_sizes_are_kept() {
+    fn margins_and_sizes_are_respected() {
         let square = square(200, 100);
         assert_eq!(corners(&square, 14).len(), 4);
         assert!(corners(&square, 20).is_empty(), "the corners are beside it");

@@ -1,4 +1,4 @@
-//! What an image looks like: corners at several scales, each with an orientation and a binary descriptor (Rublee et al.
+//! Appearance of an image: corners at several scales, each with an orientation and a binary descriptor (Rublee et al.
 //! 2011).
 
 use std::cmp::Reverse;
@@ -7,45 +7,45 @@ use super::corners::{Corner, CornerFinder};
 use super::pattern::{ORIENTATIONS, Pattern, RADIUS_PX, WORDS};
 use super::scales::{self, MOST_SCALES, Scale};
 
-/// Most features of an image.
+/// Maximum number of features of an image.
 pub const MAX_FEATURES: usize = 200;
 
-/// A corner and what is around it.
+/// A corner and its surroundings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Feature {
-    /// Where it is.
+    /// Its position in the image.
     pub place: FeaturePlace,
-    /// Which of the pixels around it are darker than others.
+    /// Results of the comparisons between surrounding pixels: which are darker than others.
     pub bits: [u64; WORDS],
 }
 
-/// Where a feature is in its image.
+/// Position of a feature in its image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FeaturePlace {
     /// Column, pixels of the image.
     pub u: u16,
     /// Row.
     pub v: u16,
-    /// Step of its direction, of 32 all around.
+    /// Step of its direction, 32 per turn.
     pub orientation: u8,
-    /// Scale that it was found on.
+    /// Scale at which it was found.
     pub scale: u8,
 }
 
-/// What an image looks like.
+/// Appearance of an image.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Description {
     /// Size of the image, pixels.
     pub(super) width: u16,
     pub(super) height: u16,
     pub(super) features: Vec<Feature>,
-    /// For each feature, comparisons that noise may turn over; none where it was kept on disk.
+    /// For each feature, comparisons that noise may flip; empty if read from disk.
     pub(super) unsure: Vec<[u64; WORDS]>,
 }
 
 impl Description {
-    /// Of an image of so many pixels, by features that were kept; `None` where one is not of such an image, or there are
-    /// none, or too many.
+    /// From stored features of an image of this size; `None` where one does not fit such an image, or there are none,
+    /// or too many.
     pub fn of_features(width: usize, height: usize, features: Vec<Feature>) -> Option<Self> {
         let is_possible = |Feature { place, .. }: &Feature| {
             usize::from(place.u) < width
@@ -77,9 +77,9 @@ pub struct Describer {
 }
 
 impl Describer {
-    /// Of an image, row after row; `None` where it is too small, or shows nothing.
+    /// Describes an image, given row by row; `None` where it is too small, or shows nothing.
     pub fn describe(&mut self, pixels: &[u8], width: usize, height: usize) -> Option<Description> {
-        /// Fewest pixels of a side: of a scale.
+        /// Least side of a scale.
         const LEAST_PX: usize = 72;
         let is_sized = |side: usize| (LEAST_PX..=usize::from(u16::MAX)).contains(&side);
         if !is_sized(width) || !is_sized(height) || pixels.len() != width * height {
@@ -93,7 +93,7 @@ impl Describer {
             unsure: Vec::with_capacity(MAX_FEATURES),
         };
         let areas: Vec<usize> = self.scales.iter().map(|s| s.width * s.height).collect();
-        // The smallest scales first: what they leave over is for the larger ones.
+        // The smallest scales first: their unused budget goes to the larger ones.
         for k in (0..self.scales.len()).rev() {
             let left = MAX_FEATURES - description.features.len();
             let share = areas[k] as f32 / areas[..=k].iter().sum::<usize>() as f32;
@@ -117,21 +117,21 @@ impl Describer {
     }
 }
 
-/// Grey levels by which the circle around a corner differs: of clear ones, and where there are few beyond the noise of a
-/// small sensor.
+/// Grey levels by which the circle around a corner differs: for clear corners, and where there are few of them just
+/// above the noise of a small sensor.
 const THRESHOLDS: [u8; 2] = [24, 8];
-/// Times as many corners as are wanted that are enough to choose from.
+/// Corners that are enough to choose from, as a multiple of those wanted.
 const LEAST_CORNERS: usize = 3;
-/// Pixels from the edge that a descriptor needs.
+/// Pixels that a descriptor needs to the edge.
 const MARGIN_PX: usize = RADIUS_PX as usize + 1;
 
-/// The strongest corners, spread over the image.
+/// Chooses the strongest corners, spread over the image.
 fn choose(corners: &mut [Corner], scale: &Scale, budget: usize, chosen: &mut Vec<Corner>) {
-    /// Parts of the image that share the corners.
+    /// Cells of the image that share the corners.
     const PARTS: [usize; 2] = [8, 6];
-    /// A part has at most so many times its share.
+    /// Most corners of a cell, as a multiple of its share.
     const MOST_SHARES: usize = 3;
-    /// Times as many corners as are wanted that are looked at: the strongest.
+    /// Strongest corners that are considered, as a multiple of those wanted.
     const MOST_CONSIDERED: usize = 10;
     let most = (MOST_SHARES * budget).div_ceil(PARTS[0] * PARTS[1]);
     let mut counts = [0usize; PARTS[0] * PARTS[1]];
@@ -192,7 +192,7 @@ fn feature(
     (Feature { place, bits }, unsure)
 }
 
-/// Direction of the centre of brightness (Rosin 1999).
+/// Direction of the intensity centroid (Rosin 1999).
 fn orientation(scale: &Scale, at: usize) -> u8 {
     let (mut across, mut down) = (0i32, 0i32);
     for y in -RADIUS_PX..=RADIUS_PX {
@@ -225,7 +225,7 @@ mod tests {
         Describer::default().describe(pixels, width, height).unwrap()
     }
 
-    /// Share of the features of one that another has within a few pixels, turned by so many steps, with few other bits.
+    /// Share of the features of one that another has within a few pixels, rotated by so many steps, with similar bits.
     fn share_found(
         one: &Description,
         other: &Description,
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn features_are_found_again_in_another_light() {
+    fn features_are_found_again_under_different_lighting() {
         let pixels = image();
         let (width, height) = (CAMERA.width, CAMERA.height);
         let here = described(&pixels, width, height);
@@ -256,10 +256,10 @@ mod tests {
     }
 
     #[test]
-    fn features_are_found_again_in_an_image_on_its_side() {
+    fn features_are_found_again_in_a_rotated_image() {
         let pixels = image();
         let (width, height) = (CAMERA.width, CAMERA.height);
-        // What was right is below: column u of the new image is row height − 1 − u of the old.
+        // Right becomes down: column u of the new image is row height − 1 − u of the old.
         let turned: Vec<u8> = (0..width * height)
             .map(|k| pixels[(height - 1 - k % height) * width + k / height])
             .collect();
@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_too_small_or_shows_nothing_has_no_description() {
+    fn an_image_that_is_too_small_or_shows_nothing_has_no_description() {
         let mut describer = Describer::default();
         assert!(describer.describe(&[70; 320 * 240], 320, 240).is_none(), "a wall");
         assert!(describer.describe(&[70; 40 * 40], 40, 40).is_none());
@@ -304,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn a_describer_gives_the_same_whatever_it_saw_before() {
+    fn a_describer_gives_the_same_whatever_it_described_before() {
         let pixels = image();
         let mut used = Describer::default();
         let _other = used.describe(&[9; 640 * 480], 640, 480);

@@ -1,4 +1,4 @@
-//! The index of keyframes by what they look like.
+//! The index of keyframes by appearance.
 
 use std::collections::BTreeMap;
 
@@ -9,31 +9,30 @@ use super::description::{Description, FeaturePlace, MAX_FEATURES};
 use super::tree::{Entry, Tree, distance};
 use crate::slam::geometry::intrinsics::Intrinsics;
 
-/// Bits of 256 in which descriptors of the same corner differ at most.
+/// Largest number of the 256 bits in which descriptors of the same corner differ.
 const MAX_DISTANCE: u32 = 50;
-/// Leaves that are searched for a feature.
+/// Number of leaves searched for a feature.
 const LEAVES: usize = 4;
-/// Keyframes with most matches whose arrangement is looked at.
+/// Keyframes with most matches whose arrangement is examined.
 const MOST_ARRANGED: usize = 30;
 
-/// A keyframe that may show what an image does.
+/// A keyframe that may show the same place as an image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlaceCandidate {
     /// The keyframe.
     pub keyframe_id: u64,
-    /// Features that both show, in the same arrangement.
+    /// Number of features that both show, in the same arrangement.
     pub score: f32,
-    /// Angle by which the image is turned in its plane, radians: a direction in the keyframe's image plus this is the same in
-    /// the image.
+    /// In-plane rotation of the image, radians: a direction in the keyframe's image plus this is the same in the image.
     pub turn_rad: f32,
-    /// A pixel of the image, the middle of the features that both show.
+    /// A pixel of the image, the mean of the features that both show.
     pub pixel: [f32; 2],
-    /// The keyframe's pixel that shows the same.
+    /// The corresponding pixel of the keyframe.
     pub keyframe_pixel: [f32; 2],
 }
 
 impl PlaceCandidate {
-    /// `keyframe_from_image`: lays the pixels that show the same on each other, with the turn in the image's plane.
+    /// `keyframe_from_image`: aligns the corresponding pixels, with the rotation in the image's plane.
     pub fn rotation(&self, camera: &Intrinsics) -> UnitQuaternion<f64> {
         let ray = |[u, v]: [f32; 2]| {
             let (x, y) = (f64::from(u) - camera.cx, f64::from(v) - camera.cy);
@@ -51,12 +50,12 @@ impl PlaceCandidate {
 #[derive(Debug, Clone)]
 struct Slot {
     keyframe_id: u64,
-    /// Whether it was taken out; its entries are still there.
+    /// Whether it was removed; its entries are still in the tree.
     is_removed: bool,
     places: Vec<FeaturePlace>,
 }
 
-/// Keyframes by what they look like.
+/// Keyframes indexed by appearance.
 #[derive(Debug, Clone, Default)]
 pub struct PlaceIndex {
     tree: Tree,
@@ -66,27 +65,27 @@ pub struct PlaceIndex {
 }
 
 impl PlaceIndex {
-    /// Keyframes in it.
+    /// Number of keyframes.
     pub fn len(&self) -> usize {
         self.slot_of.len()
     }
 
-    /// Whether there are none.
+    /// Whether there are no keyframes.
     pub fn is_empty(&self) -> bool {
         self.slot_of.is_empty()
     }
 
-    /// Whether a keyframe is in it.
+    /// Whether it contains a keyframe.
     pub fn contains(&self, keyframe_id: u64) -> bool {
         self.slot_of.contains_key(&keyframe_id)
     }
 
-    /// The keyframes in it, in order.
+    /// Ids of its keyframes, in order.
     pub fn keyframe_ids(&self) -> impl Iterator<Item = u64> {
         self.slot_of.keys().copied()
     }
 
-    /// Enters a keyframe, in place of what was known of it.
+    /// Inserts a keyframe, replacing any earlier entry of it.
     pub fn insert(&mut self, keyframe_id: u64, description: &Description) {
         self.remove(keyframe_id);
         let slot = self.slots.len() as u32;
@@ -99,7 +98,7 @@ impl PlaceIndex {
         self.slot_of.insert(keyframe_id, slot);
     }
 
-    /// Takes a keyframe out; whether it was there.
+    /// Removes a keyframe; returns whether it was present.
     pub fn remove(&mut self, keyframe_id: u64) -> bool {
         let Some(slot) = self.slot_of.remove(&keyframe_id) else { return false };
         let slot = &mut self.slots[slot as usize];
@@ -112,7 +111,7 @@ impl PlaceIndex {
         true
     }
 
-    /// Frees what removed keyframes have left.
+    /// Frees the entries of removed keyframes.
     fn sweep(&mut self) {
         let slots = &self.slots;
         self.tree.retain(|entry| !slots[entry.slot as usize].is_removed);
@@ -131,8 +130,8 @@ impl PlaceIndex {
         self.removed = 0;
     }
 
-    /// The keyframes, `most` of them, that share most features with an image in one arrangement, best first, of equals the
-    /// newest; without those that are `excluded`.
+    /// The `most` keyframes that share most features with an image in one arrangement, best first, the newest first
+    /// among equals; without those that are `excluded`.
     pub fn candidates(
         &self,
         description: &Description,
@@ -192,7 +191,7 @@ impl PlaceIndex {
         matches
     }
 
-    /// How the features of one keyframe that match lie.
+    /// The arrangement of one keyframe's matching features.
     fn arranged(&self, description: &Description, matches: &mut [Match]) -> Option<Arrangement> {
         matches.sort_by_key(|m| (m.distance, m.ours));
         let pairs: Vec<(FeaturePlace, FeaturePlace)> = matches
@@ -246,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_is_found_from_aside_turned_and_rolled() {
+    fn a_place_is_found_from_the_side_rotated_and_rolled() {
         let index = around();
         for (twist, expected) in [
             ([0.2, -0.1, 0.1, 0.0, 0.0, 0.0], 10),
@@ -265,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn those_that_are_excluded_or_taken_out_are_not_found() {
+    fn excluded_or_removed_keyframes_are_not_found() {
         let mut index = around();
         let here = seen([0.0; 6], 99);
         assert_eq!(ids(&index.candidates(&here, 1, |_| false)), [10]);
@@ -279,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_taken_out_leaves_no_memory_and_no_trace() {
+    fn removed_keyframes_leave_no_memory_and_no_trace() {
         let views: Vec<Description> = (0..6).map(|k| seen(panned(f64::from(k)), 7)).collect();
         let mut index = around();
         let bytes = index.bytes();
@@ -294,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn of_equals_the_newest_is_first_and_an_id_is_entered_once() {
+    fn the_newest_of_equals_is_first_and_an_id_is_inserted_once() {
         let mut index = PlaceIndex::default();
         let here = seen([0.0; 6], 1);
         [4, 9, 4].into_iter().for_each(|id| index.insert(id, &here));
@@ -303,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn a_description_that_was_kept_finds_and_is_found() {
+    fn a_stored_description_finds_and_is_found() {
         let here = seen([0.0; 6], 1);
         let features = here.features().to_vec();
         let kept = Description::of_features(CAMERA.width, CAMERA.height, features).unwrap();

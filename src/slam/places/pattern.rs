@@ -1,12 +1,12 @@
-//! The pairs of pixels that a descriptor compares, turned with the feature (Calonder et al. 2010; Rublee et al. 2011).
+//! The pairs of pixels that a descriptor compares, rotated with the feature (Calonder et al. 2010; Rublee et al. 2011).
 
 /// Comparisons of a descriptor: its bits.
 pub(super) const BITS: usize = 256;
 /// Words of 64 bits that hold them.
 pub const WORDS: usize = BITS / 64;
-/// Steps of a feature's orientation all around, 11° each: a comparison tolerates half of that.
+/// Orientations per turn, 11° each: a comparison tolerates half of that.
 pub(super) const ORIENTATIONS: usize = 32;
-/// Farthest pixel of a comparison from the feature, pixels, however it is turned.
+/// Largest distance of a comparison's pixel from the feature, pixels, in any orientation.
 pub(super) const RADIUS_PX: i32 = 15;
 
 /// Two pixels relative to the feature: columns and rows.
@@ -31,23 +31,23 @@ impl Default for Pattern {
 }
 
 impl Pattern {
-    /// Those of an orientation.
+    /// The pairs for an orientation.
     pub(super) fn turned(&self, orientation: u8) -> &[Pair] {
         let begin = BITS * (usize::from(orientation) % ORIENTATIONS);
         &self.0[begin..begin + BITS]
     }
 }
 
-/// The angle that an orientation stands for.
+/// The angle of an orientation.
 pub(super) fn angle_rad(orientation: usize) -> f64 {
     std::f64::consts::TAU * orientation as f64 / ORIENTATIONS as f64
 }
 
-/// Pairs that scatter around the feature as is best without a training (Calonder et al. 2010, G II), drawn once for all.
+/// Pairs scattered around the feature as is best without training (Calonder et al. 2010, G II), drawn once for all.
 fn upright() -> Vec<[[f64; 2]; 2]> {
     /// Standard deviation of either coordinate: a fifth of the patch.
     const SCATTER_PX: f64 = 6.2;
-    /// Shorter pairs tell noise.
+    /// Shorter pairs measure noise.
     const LEAST_LENGTH_PX: f64 = 4.0;
     let mut state = 1u64;
     let mut uniform = move || {

@@ -1,6 +1,6 @@
 //! An image at several scales, and the same blurred.
 
-/// Size relation of one scale to the next.
+/// Ratio of successive scales.
 pub(super) const SCALE_STEP: f32 = 1.25;
 
 /// One scale.
@@ -11,11 +11,11 @@ pub(super) struct Scale {
     pub(super) pixels: Vec<u8>,
     /// Blurred by two pixels, against noise and small shifts.
     pub(super) blurred: Vec<u8>,
-    /// Pixels of the image for one of this scale.
+    /// Pixels of the image per pixel of this scale.
     pub(super) factor: f32,
 }
 
-/// Fills `scales` with an image from its largest scale on.
+/// Fills `scales` from an image, the largest scale first.
 pub(super) fn fill(
     scales: &mut Vec<Scale>,
     pixels: &[u8],
@@ -49,14 +49,14 @@ pub(super) fn fill(
         blur(&scale.pixels, scale.width, scratch, &mut scale.blurred);
     }
 }
-/// Longer side of the largest scale: finer than that there is noise and compression.
+/// Longer side of the largest scale: finer detail is noise and compression.
 const LARGEST_PX: usize = 512;
-/// Scales of an image.
+/// Maximum number of scales of an image.
 pub(super) const MOST_SCALES: usize = 7;
-/// Shorter side of the smallest: two descriptors beside each other.
+/// Shorter side of the smallest: two descriptors side by side.
 const SMALLEST_PX: usize = 72;
 
-/// Means over the area of a pixel, where that is larger than one of the source; else bilinear.
+/// Resamples bilinearly.
 fn resample(
     from: &[u8],
     [width, height]: [usize; 2],
@@ -96,7 +96,7 @@ fn resample(
     }
 }
 
-/// Gaussian of two pixels; edges are repeated.
+/// Gaussian blur of two pixels; edges are repeated.
 fn blur(from: &[u8], width: usize, scratch: &mut Vec<u16>, to: &mut Vec<u8>) {
     let height = from.len() / width.max(1);
     scratch.clear();

@@ -1,22 +1,22 @@
-//! A binary tree over binary descriptors that grows with them (Schlegel, Grisetti 2018): a node asks for one bit, a leaf
-//! that is full is split at the bit that halves it best.
+//! A binary tree over binary descriptors that grows with them (Schlegel, Grisetti 2018): a node tests one bit, a full
+//! leaf is split at the bit that halves it best.
 
 use super::pattern::{BITS, WORDS};
 
-/// Entries beyond which a leaf is split.
+/// Number of entries beyond which a leaf is split.
 const SPLIT_AT: usize = 48;
-/// Entries that a leaf which no bit splits keeps: more that look the same tell nothing.
+/// Maximum number of entries of a leaf that no bit splits: more identical ones add nothing.
 const MOST_IN_LEAF: usize = 4 * SPLIT_AT;
 /// Least share of the entries on the smaller side of a split.
 const LEAST_SHARE: f32 = 0.1;
 
-/// A descriptor and whose it is.
+/// A descriptor and its owner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Entry {
     pub(super) bits: [u64; WORDS],
-    /// Place of the keyframe in the index.
+    /// Index of the keyframe's slot.
     pub(super) slot: u32,
-    /// Number of the feature in the keyframe.
+    /// Index of the feature in the keyframe.
     pub(super) feature: u16,
 }
 
@@ -39,7 +39,7 @@ impl Default for Tree {
 }
 
 impl Tree {
-    /// Enters a descriptor.
+    /// Inserts a descriptor.
     pub(super) fn insert(&mut self, entry: Entry) {
         let at = self.leaf_of(&entry.bits);
         let Node::Leaf(entries) = &mut self.nodes[at] else { return };
@@ -71,8 +71,8 @@ impl Tree {
         at
     }
 
-    /// Visits the leaf of a descriptor, and `most − 1` others at most that it would be in if one of its `unsure` bits were
-    /// another.
+    /// Visits the leaf of a descriptor, and at most `most − 1` others in which it would be if one of its `unsure` bits
+    /// were flipped.
     pub(super) fn visit(
         &self,
         bits: &[u64; WORDS],
@@ -108,9 +108,9 @@ impl Tree {
         }
     }
 
-    /// Takes entries out, and joins leaves that could be one.
+    /// Removes entries, and joins leaves that together are small.
     pub(super) fn retain(&mut self, is_kept: impl Fn(&Entry) -> bool) {
-        // Children come after their parents.
+        // Children have higher indices than their parents.
         for at in (0..self.nodes.len()).rev() {
             match &mut self.nodes[at] {
                 Node::Leaf(entries) => {
@@ -128,7 +128,7 @@ impl Tree {
         self.pack();
     }
 
-    /// The entries of two leaves that fill half a leaf at most.
+    /// The entries of two leaves that together fill at most half a leaf.
     fn joined(&mut self, [one, other]: [u32; 2]) -> Option<Vec<Entry>> {
         let [Node::Leaf(unset), Node::Leaf(set)] =
             self.nodes.get_disjoint_mut([one as usize, other as usize]).ok()?
@@ -142,7 +142,7 @@ impl Tree {
         })
     }
 
-    /// Drops nodes that nothing leads to.
+    /// Drops unreachable nodes.
     fn pack(&mut self) {
         let mut old = std::mem::take(&mut self.nodes);
         let mut order = vec![0usize];
@@ -161,7 +161,7 @@ impl Tree {
         }
     }
 
-    /// Gives keyframes the places `new` has for theirs.
+    /// Replaces the slot of each keyframe by its value in `new`.
     pub(super) fn renumber(&mut self, new: &[u32]) {
         for node in &mut self.nodes {
             if let Node::Leaf(entries) = node {
@@ -180,14 +180,14 @@ impl Tree {
     }
 }
 
-/// Most leaves that are visited for one descriptor.
+/// Maximum number of leaves that are visited for one descriptor.
 pub(super) const MOST_LEAVES: usize = 16;
 
 fn has(bits: &[u64; WORDS], bit: u16) -> bool {
     bits[usize::from(bit) / 64] >> (bit % 64) & 1 == 1
 }
 
-/// The bit that is set in the share of the entries closest to a half.
+/// The bit that is set in a share of the entries closest to one half.
 fn best_bit(entries: &[Entry]) -> Option<u16> {
     let mut counts = [0usize; BITS];
     for entry in entries {
@@ -202,7 +202,7 @@ fn best_bit(entries: &[Entry]) -> Option<u16> {
     (smaller(best) as f32 >= LEAST_SHARE * entries.len() as f32).then_some(best as u16)
 }
 
-/// Bits that differ.
+/// Number of bits that differ.
 #[inline(always)]
 pub(super) fn distance(one: &[u64; WORDS], other: &[u64; WORDS]) -> u32 {
     one.iter().zip(other).map(|(a, b)| (a ^ b).count_ones()).sum()
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_entered_is_found_among_few() {
+    fn an_inserted_descriptor_is_found_among_few() {
         let mut random = Random::new(1);
         let mut tree = Tree::default();
         let all: Vec<_> = (0..5_000).map(|_| random_bits(&mut random)).collect();
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bit_that_turned_over_is_met_where_it_was_unsure() {
+    fn a_flipped_bit_is_found_if_it_was_unsure() {
         let mut random = Random::new(2);
         let mut tree = Tree::default();
         let all: Vec<_> = (0..5_000).map(|_| random_bits(&mut random)).collect();
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn what_looks_the_same_a_thousand_times_is_kept_a_few_times() {
+    fn identical_descriptors_are_kept_only_a_few_times() {
         let mut tree = Tree::default();
         (0..1_000).for_each(|slot| tree.insert(Entry { bits: [7; WORDS], slot, feature: 0 }));
         assert_eq!(found(&tree, &[7; WORDS], &[0; WORDS], 1).len(), MOST_IN_LEAF);
@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn taking_out_keeps_the_others_and_joins_leaves() {
+    fn removal_keeps_the_others_and_joins_leaves() {
         let mut random = Random::new(3);
         let mut tree = Tree::default();
         let all: Vec<_> = (0..5_000).map(|_| random_bits(&mut random)).collect();

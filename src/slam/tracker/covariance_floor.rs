@@ -1,14 +1,14 @@
-//! What a published covariance holds beside noise and the keyframe's common depth errors: displacements of the whole
-//! image, of which the residuals show only the part that differs from tile to tile.
+//! The part of a published covariance beyond noise and the keyframe's common depth errors: displacements of the whole
+//! image, of which the residuals show only the part that differs between tiles.
 //!
 //! ```text
 //! Σ_published = Σ_alignment + (M⁻¹H) P (M⁻¹H)ᵀ + diag(σ_t² I, σ_ω² I)
 //! σ_ω² = (image_px / f)² + (misfit_ratio · misfit)²      σ_t = σ_ω / d̄
 //! ```
-//! `misfit` is by how much tiles of this very image are displaced beyond the noise of single pixels: 0.03 px in the
-//! simulator, 0.3 to 0.5 px where lens, rolling shutter and the shape of the depth come in. It tells cameras apart
-//! that one constant cannot serve. Only what is published has it: matching, keyframes and verdicts use the covariance
-//! of the alignment.
+//! `misfit` is the displacement of tiles of this very image beyond the noise of single pixels: 0.03 px in the
+//! simulator, 0.3 to 0.5 px where lens, rolling shutter and the shape of the depth play a part. It distinguishes
+//! cameras that one constant cannot serve. Only the published covariance includes it: matching, keyframes and verdicts
+//! use the covariance of the alignment.
 
 use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
@@ -17,16 +17,15 @@ use crate::slam::alignment::misfit::TileMisfit;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::parameter::{ParameterError, check_range};
 
-/// Displacement of the whole image that the published covariance of a pose allows for.
+/// Parameters of the displacement of the whole image in the published covariance of a pose.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CovarianceFloorParams {
-    /// Standard deviation by which an image may be displaced whatever it shows, pixels: what interpolation leaves
-    /// of an exact image.
+    /// Standard deviation of the displacement of any image, pixels: the interpolation error of an exact image.
     pub image_px: f64,
-    /// Displacement of the whole image for one of its tiles beyond noise. The errors behind both are smooth, so that
-    /// more of them is common to the image than differs between its tiles. Calibrated on the map's own depth over
-    /// rooms and recordings.
+    /// Displacement of the whole image per displacement of one of its tiles beyond noise. The errors behind both are
+    /// smooth, so more of them is common to the image than differs between its tiles. Calibrated on the map's own depth
+    /// over rooms and recordings.
     pub misfit_ratio: f64,
 }
 
@@ -43,8 +42,8 @@ impl CovarianceFloorParams {
         check_range("misfit_ratio", self.misfit_ratio, 0.0..=100.0)
     }
 
-    /// Standard deviation of the displacement of an image, pixels, whose tiles and mean whitened squared residual are
-    /// these.
+    /// Standard deviation of the displacement of an image, pixels, from the misfit of its tiles and the mean whitened
+    /// squared residual.
     pub fn displacement_px(
         &self,
         misfit: &TileMisfit,
@@ -81,9 +80,9 @@ mod tests {
         Intrinsics { fx: 500.0, fy: 400.0, cx: 0.0, cy: 0.0, width: 64, height: 48 };
 
     #[test]
-    fn tiles_that_are_displaced_widen_it() {
+    fn displaced_tiles_widen_the_covariance() {
         let floor = CovarianceFloorParams { image_px: 0.3, misfit_ratio: 2.0 };
-        // A tile of noise alone, and one that is displaced by 0.2 px beside it.
+        // A tile with noise only, and one that is displaced by 0.2 px in addition.
         let noise = (0.1f64 / 400.0).powi(2);
         let misfit = |beyond_px: f64| TileMisfit {
             variance: 0.5 * noise + (beyond_px / 400.0).powi(2),
@@ -97,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn it_scales_with_lens_and_depth() {
+    fn the_covariance_scales_with_lens_and_depth() {
         let covariance = displacement_covariance(2.0, &CAMERA, 0.5);
         assert!((covariance[(4, 4)].sqrt() - 0.005).abs() < 1e-12);
         assert!((covariance[(1, 1)].sqrt() - 0.01).abs() < 1e-12);

@@ -1,4 +1,4 @@
-//! Whatever frames and keyframes hold: no panic, nothing non-finite, and a good frame is tracked after it.
+//! The tracker accepts arbitrary input: no panic, nothing non-finite, and a good frame is tracked afterwards.
 
 use nalgebra::{Matrix6, Vector6};
 use proptest::prelude::*;
@@ -22,7 +22,7 @@ fn plane() -> Plane {
     Plane::new([0.12, -0.2, 0.95], [8.0, 80.0], &CAMERA)
 }
 
-/// Numbers that a broken or hostile message may hold.
+/// Numbers that a broken or malicious message may contain.
 fn hostile_number() -> impl Strategy<Value = f32> {
     const EXTREMES: [f32; 17] = [
         f32::NAN,
@@ -46,12 +46,12 @@ fn hostile_number() -> impl Strategy<Value = f32> {
     prop::sample::select(EXTREMES.to_vec())
 }
 
-/// What is done to a keyframe.
+/// Damage done to a keyframe.
 #[derive(Debug, Clone)]
 struct Harm {
-    /// Points that are left.
+    /// Number of points that are left.
     points: usize,
-    /// Every so many points get the numbers below.
+    /// Every n-th point gets the numbers below.
     stride: usize,
     inverse_depth: Option<f32>,
     variance: Option<f32>,
@@ -102,7 +102,7 @@ impl Harm {
     }
 }
 
-/// What a camera may show.
+/// Images that a camera may deliver.
 #[derive(Debug, Clone)]
 enum Picture {
     Constant(u8),
@@ -145,7 +145,7 @@ impl Picture {
     }
 }
 
-/// Where the camera was last: anywhere, also so that every point is behind it.
+/// The last pose of the camera: anywhere, also with every point behind it.
 fn pose() -> impl Strategy<Value = SE3> {
     let size = prop::sample::select(vec![0.0, 0.01, 0.3, 3.0, 1e3, 1e9, 1e30]);
     (size, prop::array::uniform3(-1.0f64..1.0), prop::array::uniform3(-3.1f64..3.1)).prop_map(
@@ -191,7 +191,7 @@ proptest! {
             let estimate = tracker.track(&view(&pixels, sequence, capture_nanos), &mut budget);
             prop_assert!(is_clean(&estimate), "{estimate:?}");
         }
-        // A sound keyframe of the next epoch, and all is forgotten.
+        // After a sound keyframe of the next epoch all is forgotten.
         let next = Keyframe { keyframe_id: 4, epoch: good.epoch + 1, ..good.clone() };
         tracker.adopt(Box::new(Reference::prepare(&next)));
         let estimate = tracker.track(&view(&good.image, 9, 9), &mut |_| true);
@@ -200,7 +200,7 @@ proptest! {
 }
 
 #[test]
-fn where_a_place_is_beyond_all_numbers_nothing_is_known_of_the_pose_in_the_map() {
+fn a_keyframe_pose_that_overflows_leaves_the_pose_in_the_map_unknown() {
     let good = plane().keyframe(&CAMERA, 2, 0.02);
     for (x, scale) in [(1.0, 1e200), (1e160, 1.0)] {
         let place = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
@@ -216,7 +216,7 @@ fn where_a_place_is_beyond_all_numbers_nothing_is_known_of_the_pose_in_the_map()
 }
 
 #[test]
-fn the_smallest_images_neither_panic_nor_lie() {
+fn the_smallest_images_neither_panic_nor_give_wrong_poses() {
     for (width, height) in [(16, 16), (17, 16), (16, 33), (20, 200)] {
         let camera = Intrinsics { cx: 7.5, cy: 7.5, width, height, ..CAMERA };
         let plane = Plane::new([0.12, -0.2, 0.95], [8.0, 80.0], &camera);

@@ -1,7 +1,7 @@
-//! Where the camera will be: constant velocity in the world, and what else it may have done.
+//! Predicts the camera's pose: constant velocity in the world, and alternatives.
 //!
-//! Poses are kept in the world, so that a new keyframe or refined depth disturbs nothing; where the map is corrected
-//! they follow their keyframe.
+//! Poses are kept in the world, so that a new keyframe or refined depth does not affect them; where the map is
+//! corrected they follow their keyframe.
 
 use nalgebra::Vector6;
 
@@ -17,11 +17,11 @@ pub struct Motion {
     velocity: Option<(Vector6<f64>, f64)>,
 }
 
-/// A velocity is not carried on for longer than this many of the intervals it was measured over.
+/// Longest extrapolation of a velocity, in intervals over which it was measured.
 const LONGEST_EXTRAPOLATION: f64 = 3.0;
 
 impl Motion {
-    /// Takes in a good pose.
+    /// Records a good pose.
     pub fn observe(&mut self, nanos: i64, world_from_camera: &SE3) {
         self.velocity = self.last.and_then(|(before, last)| {
             let interval = nanos.checked_sub(before).filter(|&interval| interval > 0)?;
@@ -31,7 +31,7 @@ impl Motion {
         self.last = Some((nanos, *world_from_camera));
     }
 
-    /// The keyframe that the poses are known from has been moved: they stay where they are relative to it.
+    /// Moves the poses with the keyframe that they are relative to.
     pub fn follow(&mut self, before: &Sim3, after: &Sim3) {
         if before == after {
             return;
@@ -50,13 +50,13 @@ impl Motion {
         self.velocity = None;
     }
 
-    /// The last step: twist of `before_from_last`, world units and radians, and the seconds it took; `None` where that is not
-    /// known.
+    /// The last step: twist of `before_from_last`, world units and radians, and its duration in seconds; `None` where
+    /// unknown.
     pub fn last_step(&self) -> Option<(Vector6<f64>, f64)> {
         self.velocity.map(|(twist, interval)| (twist, interval * 1e-9))
     }
 
-    /// How fast the camera moved last, world units a second; `None` where that is not known.
+    /// The camera's last speed, world units per second; `None` where unknown.
     pub fn speed(&self) -> Option<f64> {
         /// Nanoseconds in a second.
         const SECOND: f64 = 1e9;
@@ -64,8 +64,8 @@ impl Motion {
         Some(twist.fixed_rows::<3>(0).norm() * SECOND / interval)
     }
 
-    /// By how far the next frame, at `nanos`, may be from an even motion, in intervals of 30 Hz since the last pose (at
-    /// least one) and in what the camera has moved last; `None` where that is not known.
+    /// Scale for the deviation of the next frame, at `nanos`, from constant motion: the intervals of 30 Hz since the
+    /// last pose (at least one), and the predicted step; `None` where unknown.
     pub fn step(&self, nanos: i64) -> Option<(f64, SE3)> {
         /// A frame at 30 Hz, nanoseconds.
         const INTERVAL: f64 = 1e9 / 30.0;
@@ -81,13 +81,12 @@ impl Motion {
         self.last.map(|(_, last)| last)
     }
 
-    /// The same with its stamp, nanoseconds.
+    /// The last good pose with its stamp, nanoseconds.
     pub fn last_seen(&self) -> Option<(i64, SE3)> {
         self.last
     }
 
-    /// The pose at `nanos` if the camera moved on with `factor` of its velocity; `None` before
-    /// the first pose.
+    /// The pose at `nanos` if the camera continues with `factor` times its velocity; `None` before the first pose.
     pub fn predict(&self, nanos: i64, factor: f64) -> Option<SE3> {
         let (before, last) = self.last?;
         let Some((twist, interval)) = self.velocity else { return Some(last) };
@@ -97,11 +96,11 @@ impl Motion {
     }
 }
 
-/// Shares of the velocity that are tried when constant motion fits badly.
+/// Factors on the velocity that are tried when constant motion fits badly.
 const VELOCITY_FACTORS: [f64; 3] = [0.0, 0.5, 2.0];
 
-/// Other poses the camera may have at `nanos`: other shares of its velocity, and `rotation_rad`
-/// about each axis either way, from where it stood.
+/// Other possible poses of the camera at `nanos`: with other factors on its velocity, and rotated by `rotation_rad`
+/// about each axis either way from its last pose.
 pub fn hypotheses(motion: &Motion, nanos: i64, rotation_rad: f64) -> impl Iterator<Item = SE3> {
     let speeds = VELOCITY_FACTORS.map(|factor| motion.predict(nanos, factor));
     let last = motion.last();
@@ -113,8 +112,8 @@ pub fn hypotheses(motion: &Motion, nanos: i64, rotation_rad: f64) -> impl Iterat
     speeds.into_iter().chain(turns).flatten()
 }
 
-/// A camera as it stands, panned and tilted by `rotation_rad` either way and both, and rolled: the views
-/// from which a coarse alignment finds it, wherever it looks near there.
+/// A camera's pose unchanged, panned and tilted by `rotation_rad` either way and both, and rolled: the views from which
+/// a coarse alignment finds any viewing direction near it.
 pub fn turned(world_from_camera: &SE3, rotation_rad: f64) -> impl Iterator<Item = SE3> {
     /// (tilt, pan, roll) in units of the rotation.
     const TURNS: [[f64; 3]; 11] = [
@@ -146,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn constant_velocity_is_carried_on_over_a_missing_frame() {
+    fn constant_velocity_continues_over_a_missing_frame() {
         let step = pose([0.1, 0.0, 0.02, 0.01, -0.03, 0.02]);
         let mut motion = Motion::default();
         assert_eq!(motion.predict(0, 1.0), None);
@@ -158,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_keyframe_does_the_camera_does_too() {
+    fn the_camera_follows_its_keyframe() {
         let before = Sim3::new(pose([0.3, 0.1, 0.0, 0.1, 0.2, 0.0]), 2.0);
         let after = Sim3::new(pose([-0.1, 0.4, 0.2, 0.0, 0.1, 0.3]), 2.5);
         let relative = [pose([0.0; 6]), pose([0.1, 0.0, 0.02, 0.01, -0.03, 0.02])];
@@ -176,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn broken_stamps_and_long_gaps_do_not_fling_the_camera_away() {
+    fn invalid_stamps_and_long_gaps_do_not_fling_the_camera_away() {
         let mut motion = Motion::default();
         motion.observe(100, &SE3::identity());
         motion.observe(100, &pose([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]));

@@ -1,4 +1,4 @@
-//! What is said of a frame: judged, with its covariance, or not claimed; and when a new keyframe is asked for.
+//! Assembles the estimate of a frame: judged, with its covariance, or not claimed; and requests new keyframes.
 
 use nalgebra::Matrix6;
 
@@ -16,7 +16,7 @@ use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::tracker::velocity::PoseErrors;
 use crate::slam::tracker::verdict::quality_of;
 
-/// Where the camera is.
+/// Pose of the camera.
 struct Placed {
     keyframe_from_camera: SE3,
     world_from_camera: SE3,
@@ -24,7 +24,7 @@ struct Placed {
 }
 
 impl Placed {
-    /// Where `alignment` finds it.
+    /// The pose found by `alignment`.
     fn of(reference: &Reference, alignment: &Alignment) -> Self {
         let keyframe_from_camera = alignment.state.current_from_keyframe.inverse();
         Self {
@@ -74,8 +74,8 @@ impl Tracker {
         self.claim(reference, alignment, &placed, &covariance, PoseEstimate { quality, ..estimate })
     }
 
-    /// An estimate with its pose and what is known of that: `covariance` is that of the alignment, to which the common
-    /// errors of the depth and the displacement of the whole image add.
+    /// An estimate with its pose and the covariance of that: `covariance` is that of the alignment, to which the common
+    /// errors of the depth and the displacement of the whole image are added.
     fn claim(
         &mut self,
         reference: &Reference,
@@ -118,7 +118,7 @@ impl Tracker {
         }
     }
 
-    /// Whether the camera is so far from the keyframe that a new one is due.
+    /// Whether a new keyframe is due: the camera is far from this one, or the light has changed.
     fn proposes_keyframe(
         &self,
         reference: &Reference,
@@ -131,9 +131,9 @@ impl Tracker {
             || self.has_other_light(reference, &alignment.state.brightness)
     }
 
-    /// Whether what has the mean grey value in the keyframe is so much brighter or darker in a frame.
+    /// Whether the keyframe's mean grey value appears brighter or darker in a frame by more than the limit.
     fn has_other_light(&self, reference: &Reference, brightness: &Brightness) -> bool {
-        /// Below a few grey levels a ratio is one of noise.
+        /// Below a few grey levels the ratio is noise.
         const LEAST_GREY: f64 = 5.0;
         let in_keyframe = reference.mean_grey().max(LEAST_GREY);
         let in_frame = (brightness.a.exp() * in_keyframe + brightness.b).max(LEAST_GREY);
@@ -150,8 +150,8 @@ impl Tracker {
         Quality { displacement_px, ..quality_of(alignment) }
     }
 
-    /// Whether a camera would be elsewhere than an even motion takes it by more than hands or wheels do: what is found
-    /// there must be as sure as after a loss. The last points at the edge of a view fit nearly anything.
+    /// Whether a pose deviates from constant motion by more than hands or wheels cause: such a pose must be as certain
+    /// as after a loss. The last points at the edge of a view fit nearly anything.
     fn has_jumped(&self, reference: &Reference, nanos: i64, world_from_camera: &SE3) -> bool {
         /// Largest change of the rotation from one frame to the next at 30 Hz, radians: 9°.
         const MOST_ROTATION_RAD: f64 = 0.15;
@@ -172,7 +172,7 @@ impl Tracker {
             || off.translation.norm() > most(MOST_TRANSLATION * mean_depth, step.translation.norm())
     }
 
-    /// The estimate of a frame that could not be aligned: the last pose again, not claimed.
+    /// The estimate of a frame that could not be aligned: repeats the last pose, not claimed.
     pub(super) fn lost(
         &mut self,
         frame: &FrameView<'_>,
@@ -199,7 +199,7 @@ impl Tracker {
         let world_from_camera = self.memory.motion.last().unwrap_or_else(SE3::identity);
         let located = reference
             .map(|reference| reference.world_from_keyframe().locate(&world_from_camera))
-            // Beyond all numbers where the keyframe's unit is absurdly small.
+            // Not finite where the keyframe's unit is absurdly small.
             .filter(SE3::is_finite);
         let keyframe_from_camera = located.unwrap_or_else(SE3::identity);
         let placed = reference

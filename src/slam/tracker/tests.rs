@@ -53,7 +53,7 @@ pub(super) fn is_clean(estimate: &PoseEstimate) -> bool {
 }
 
 #[test]
-fn a_path_over_a_plane_is_followed() {
+fn a_path_over_a_plane_is_tracked() {
     let (plane, camera) = (small_plane(), small_camera());
     let mut tracker = tracker_on(&plane.keyframe(&camera, 2, 0.02));
     for sequence in 0..=12 {
@@ -72,7 +72,7 @@ fn a_path_over_a_plane_is_followed() {
 }
 
 #[test]
-fn a_pose_in_the_map_is_as_uncertain_as_its_keyframe_and_its_pose_on_it() {
+fn the_covariance_in_the_map_combines_those_of_the_keyframe_and_of_the_pose_on_it() {
     let (plane, camera) = (small_plane(), small_camera());
     let image = plane.render(&camera, &path(3), 2.0, (1.0, 0.0), 7);
     let estimate = |deviation: f64| {
@@ -88,7 +88,7 @@ fn a_pose_in_the_map_is_as_uncertain_as_its_keyframe_and_its_pose_on_it() {
     let place = UncertainPlace::exact(Sim3::new(path(30), 0.5));
     let of_pose = place.of_camera(&exact.keyframe_from_camera, &full_covariance(&exact.covariance));
     assert!((matrices[0] - of_pose).norm() < 1e-12 * of_pose.norm(), "{}", matrices[0]);
-    // The pose on the keyframe does not turn a place's increment, but its unit moves the camera along.
+    // The pose on the keyframe does not rotate the increment of the keyframe's pose, but the unit moves the camera.
     let along = exact.map_from_camera.translation - place.map_from_keyframe.rigid.translation;
     let mut expected = Matrix6::from_diagonal_element(0.01);
     let mut positions = expected.fixed_view_mut::<3, 3>(0, 0);
@@ -101,7 +101,7 @@ fn a_pose_in_the_map_is_as_uncertain_as_its_keyframe_and_its_pose_on_it() {
 }
 
 #[test]
-fn hostile_frames_neither_panic_nor_claim_a_pose() {
+fn arbitrary_frames_neither_panic_nor_claim_a_pose() {
     let (plane, camera) = (small_plane(), small_camera());
     let keyframe = plane.keyframe(&camera, 2, 0.02);
     let size = camera.width * camera.height;
@@ -117,7 +117,7 @@ fn hostile_frames_neither_panic_nor_claim_a_pose() {
             assert!(matches!(estimate.state, TrackingState::Lost(_)), "{:?}", estimate.state);
             assert!(is_clean(&estimate));
         }
-        // And the camera comes back.
+        // And tracking recovers.
         let estimate = tracker.track(&frame(9, &keyframe.image), &mut always);
         assert!(estimate.state.is_tracked(), "{estimate:?}");
     }
@@ -159,7 +159,7 @@ fn a_bright_or_dark_scene_does_not_make_white_or_black_frames_fit() {
 }
 
 #[test]
-fn hostile_keyframes_neither_panic_nor_claim_a_pose() {
+fn arbitrary_keyframes_neither_panic_nor_claim_a_pose() {
     let (plane, camera) = (small_plane(), small_camera());
     let good = plane.keyframe(&camera, 2, 0.02);
     let image = good.image.clone();
@@ -183,7 +183,7 @@ fn hostile_keyframes_neither_panic_nor_claim_a_pose() {
 }
 
 #[test]
-fn points_behind_the_camera_are_a_loss() {
+fn a_frame_with_all_points_behind_the_camera_is_lost() {
     let (plane, camera) = (small_plane(), small_camera());
     let keyframe = plane.keyframe(&camera, 2, 0.02);
     let mut tracker = tracker_on(&keyframe);
@@ -195,7 +195,7 @@ fn points_behind_the_camera_are_a_loss() {
 }
 
 #[test]
-fn only_frames_that_are_found_say_what_a_good_fit_is() {
+fn only_tracked_frames_define_a_good_fit() {
     let (plane, camera) = (small_plane(), small_camera());
     let keyframe = plane.keyframe(&camera, 2, 0.02);
     let mut tracker = tracker_on(&keyframe);
@@ -207,7 +207,7 @@ fn only_frames_that_are_found_say_what_a_good_fit_is() {
     let estimate = tracker.track(&frame(1, &unrelated), &mut always);
     assert!(matches!(estimate.state, TrackingState::Lost(_)), "{:?}", estimate.state);
     assert_eq!(tracker.memory.coarse_fit, good, "a lost frame");
-    // Time ends within the first level of a frame that is hard to follow.
+    // Time runs out on the first level of a frame that is hard to track.
     let image = plane.render(&camera, &path(6), 2.0, (1.0, 0.0), 7);
     let mut left = 2;
     let mut short = |_: usize| {
@@ -220,12 +220,12 @@ fn only_frames_that_are_found_say_what_a_good_fit_is() {
 }
 
 #[test]
-fn of_the_coarsest_level_and_the_prediction_the_one_that_is_right_goes_on() {
+fn the_right_one_of_coarsest_level_and_prediction_is_continued() {
     let (plane, camera) = (small_plane(), small_camera());
     let mut tracker = tracker_on(&plane.keyframe(&camera, 2, 0.02));
     let reference = tracker.reference.take().unwrap();
     tracker.pyramid.fill(&plane.render(&camera, &path(6), 2.0, (1.0, 0.0), 7));
-    // From 10° away the finer level does not come back.
+    // From 10° away the finer level does not converge.
     let astray = path(6) * SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.1, -0.15, 0.0));
     for (of_coarsest, predicted) in [(astray, path(5)), (path(6), astray)] {
         let (aligner, frame) = (&tracker.aligner, &tracker.pyramid);
@@ -249,7 +249,7 @@ fn a_far_hypothesis_does_not_win_by_its_tolerance() {
     tracker.memory.was_lost = true;
     let truth = SE3::exp(&Vector6::new(0.01, 0.0, 0.0, 0.04, -0.03, 0.0));
     let mut image = plane.render(&camera, &truth, 2.0, (1.0, 0.0), 4);
-    // Something stands in the way of an eighth of the view: the right pose does not explain that.
+    // Something hides an eighth of the view: the right pose does not explain that.
     let is_hidden = |i: &usize| i % camera.width < camera.width / 8;
     for i in (0..image.len()).filter(is_hidden) {
         image[i] = if i / camera.width / 20 % 2 == 0 { 20 } else { 230 };
@@ -262,7 +262,7 @@ fn a_far_hypothesis_does_not_win_by_its_tolerance() {
 
 #[test]
 fn images_of_one_level_are_tracked_on_it() {
-    // Thermal cameras give 32×24.
+    // Thermal cameras deliver 32×24.
     for (width, height) in [(32, 24), (64, 47), (47, 64)] {
         let (fx, fy) = (0.8 * width as f64, 0.8 * width as f64);
         let (cx, cy) = (0.5 * width as f64 - 0.3, 0.5 * height as f64 - 0.7);
@@ -286,7 +286,7 @@ fn images_of_one_level_are_tracked_on_it() {
 }
 
 #[test]
-fn without_keyframe_or_trust_nothing_is_claimed() {
+fn without_a_trusted_keyframe_nothing_is_claimed() {
     let (plane, camera) = (small_plane(), small_camera());
     let mut keyframe = plane.keyframe(&camera, 2, 0.02);
     let image = keyframe.image.clone();
@@ -300,7 +300,7 @@ fn without_keyframe_or_trust_nothing_is_claimed() {
 }
 
 #[test]
-fn where_the_light_has_changed_much_another_keyframe_is_asked_for() {
+fn a_large_change_of_light_requests_another_keyframe() {
     let (plane, camera) = (small_plane(), small_camera());
     let keyframe = plane.keyframe(&camera, 2, 0.02);
     let proposes = |light: (f64, f64)| {
@@ -313,7 +313,7 @@ fn where_the_light_has_changed_much_another_keyframe_is_asked_for() {
     assert!(proposes((0.5, 0.0)) && proposes((0.6, -10.0)));
 }
 
-/// An image without noise, and many with noise of their own.
+/// An image without noise, from which many are made with independent noise.
 struct Shot(Vec<f64>);
 
 impl Shot {
@@ -333,7 +333,7 @@ impl Shot {
 }
 
 #[test]
-fn sub_pixel_motion_is_found_without_pull_from_or_to_whole_pixels() {
+fn sub_pixel_motion_is_found_without_bias_from_or_to_whole_pixels() {
     /// Pairs of images with independent noise. One keyframe for all frames would leave its own
     /// noise, 0.02 px, in the mean.
     const PAIRS: u64 = 36;
@@ -360,7 +360,7 @@ fn sub_pixel_motion_is_found_without_pull_from_or_to_whole_pixels() {
 }
 
 #[test]
-fn rehearsals_with_any_budget_leave_the_tracker_as_it_is() {
+fn rehearsals_with_any_budget_leave_the_tracker_unchanged() {
     let (plane, camera) = (small_plane(), small_camera());
     let keyframe = plane.keyframe(&camera, 2, 0.02);
     let (mut rehearsing, mut other) = (tracker_on(&keyframe), tracker_on(&keyframe));
@@ -388,7 +388,7 @@ fn rehearsals_with_any_budget_leave_the_tracker_as_it_is() {
 fn a_short_budget_is_never_worse_than_the_prediction() {
     let (plane, camera) = (small_plane(), small_camera());
     let mut tracker = tracker_on(&plane.keyframe(&camera, 2, 0.02));
-    // By the iterations that there is time for.
+    // By the number of iterations that there is time for.
     let mut errors = [const { Vec::new() }; 7];
     let mut whole_errors = Vec::new();
     for sequence in 0..=12 {
@@ -404,7 +404,7 @@ fn a_short_budget_is_never_worse_than_the_prediction() {
         if sequence > 2 {
             whole_errors.push(whole);
         }
-        // The third frame is the first whose velocity is known.
+        // The third frame is the first with a known velocity.
         for (iterations, errors) in errors.iter_mut().enumerate().filter(|_| sequence > 2) {
             let mut left = iterations;
             let mut budget = |_: usize| {
@@ -414,11 +414,11 @@ fn a_short_budget_is_never_worse_than_the_prediction() {
             };
             let short = tracker.rehearse(&memory, &frame, &mut budget);
             assert_eq!(short.state, TrackingState::Degraded(DegradedReason::Budget));
-            // A coarse level takes more than one iteration, or none is needed at all.
+            // A coarse level takes more than one iteration, or no level is needed at all.
             assert!(short.quality.finest_level > finest || iterations > 2, "{sequence}");
             let error = error_of(&short);
             errors.push(error.norm());
-            // The covariance says so: within three of its standard deviations in every direction.
+            // The covariance reflects it: within three of its standard deviations in every direction.
             let std_dev =
                 [0, 6, 11, 15, 18, 20].map(|i| short.alignment_covariance[i].sqrt() * camera.fx);
             assert!((0..6).all(|i| error[i].abs() < 3.0 * std_dev[i] + 0.1), "{error} {std_dev:?}");
@@ -429,13 +429,13 @@ fn a_short_budget_is_never_worse_than_the_prediction() {
         errors[errors.len() / 2]
     };
     let medians = errors.each_mut().map(median);
-    // A good prediction may lie nearer to the truth than noise lets any alignment come.
+    // A good prediction may be nearer to the truth than noise allows for any alignment.
     let allowed = 1.05 * medians[0].max(median(&mut whole_errors));
     assert!(medians.iter().all(|&error| error <= allowed), "{allowed} px: {medians:?}");
 }
 
 #[test]
-fn a_tracker_that_begins_on_an_unknown_map_must_fit_as_well_as_one_that_was_lost() {
+fn a_tracker_that_starts_on_another_map_must_fit_as_well_as_a_lost_one() {
     let (plane, camera) = (small_plane(), small_camera());
     let keyframe = plane.keyframe(&camera, 2, 0.02);
     // Two fifths of the view show something else.

@@ -1,9 +1,9 @@
-//! Holds the pose where the known depth is out of view: frames are aligned to the last view that had a pose, all of
-//! whose pixels take part with a depth that is not known.
+//! Holds the pose while the known depth is out of view: frames are aligned to the last view that had a pose, all of
+//! whose pixels are used with an unknown depth.
 //!
-//! That holds the rotation. The position stays where it was when the known depth was last seen, and becomes uncertain with
-//! a hand's speed; each view that takes over adds its uncertainty, and no depth is learnt meanwhile. It ends where a
-//! keyframe fits again, or where the position is no longer known.
+//! That holds the rotation. The position stays where it was when the known depth was last seen, with an uncertainty
+//! that grows at a hand's speed; each new view adds its uncertainty, and no depth is estimated meanwhile. It ends where
+//! a keyframe fits again, or where the position is too uncertain.
 
 use nalgebra::{Matrix3, Matrix6};
 
@@ -24,15 +24,15 @@ use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::tracker::verdict::quality_of;
 use crate::slam::tracker::{MOST_DEVIATIONS, Memory, Tracker};
 
-/// Change of the exposure since the view: of the logarithm of the gain, and of the offset in grey levels. Some frames
-/// pass at most; more freedom flattens a view of little contrast until it fits anything.
+/// Change of the exposure since the view: of the logarithm of the gain, and of the offset in grey levels. Only a few
+/// frames pass; more freedom flattens a view of little contrast until it fits anything.
 const GAIN_STD_DEV: f64 = 0.05;
 const OFFSET_STD_DEV: f64 = 5.0;
 
-/// Points of the view that a frame must show, at the finest level.
+/// Least number of points of the view that a frame must show, at the finest level.
 const FEWEST_POINTS: u32 = 500;
 
-/// Largest standard deviation of the rotation from the view, radians: 3°, as far as the next alignment reaches.
+/// Largest standard deviation of the rotation from the view, radians: 3°, as far as the next alignment converges.
 const MOST_ROTATION_STD_DEV: f64 = 0.05;
 
 /// Largest logarithm of the gain, either way, with which a frame is held: a blurred frame has that much less contrast
@@ -43,54 +43,54 @@ const MOST_GAIN: f64 = 0.7;
 /// acceleration that hands do not reach.
 const MOST_CHANGE_RAD: f64 = 0.15;
 
-/// Share of the points compared that the rotation must explain by the image's noise alone.
+/// Least share of the points compared that the rotation must explain by image noise alone.
 const LEAST_INLIERS: f64 = 0.8;
 
-/// Speed of a hand-held camera, mean depths a second: a standard deviation. So far from the view frames are expected;
-/// what a turning camera shows hardly tells a translation from a rotation.
+/// Speed of a hand-held camera, mean depths per second: a standard deviation. Frames are expected at that distance from
+/// the view; the images of a rotating camera hardly distinguish a translation from a rotation.
 const SPEED: f64 = 0.3;
-/// The alignment holds frames to half of that: a translation that is free takes what is not understood, and with
-/// the variance that comes with it explains any image.
+/// Factor on that in the alignment's prior: a free translation absorbs whatever is not modelled, and with the variance
+/// that comes with it explains any image.
 const TIGHTNESS: f64 = 0.5;
-/// Time since the view that this is applied to: of the fastest camera, and as long as the camera may drift anywhere. After
-/// that no view is waited for either.
+/// Bounds of the time since the view to which this applies: that of the fastest camera, and the longest after which the
+/// camera may be anywhere. Beyond it no view is kept either.
 const LEAST_SECONDS: f64 = 0.001;
 const MOST_SECONDS: f64 = 1.0;
 
-/// A frame that was cut short is displaced by this much at most, in pixels of the finest level: beyond that fewer of its
-/// points would be explained by noise.
+/// Largest displacement of a frame that was cut short, pixels of the finest level: beyond that fewer of its points
+/// would be explained by noise.
 const CUT_SHORT_PX: f64 = 1.0;
 
-/// How long a view may hold the camera though it has not turned away from the keyframe, seconds: what the blur of a jerk
-/// hides. What hides a keyframe for longer is no turn, and the mapper begins to count the loss.
+/// How long a view may hold the camera although it has not rotated away from the keyframe, seconds: as long as the blur
+/// of a jerk lasts. If it stays hidden for longer this is not a rotation, and the mapper starts to count the loss.
 const MOST_IN_VIEW_SECS: f64 = 0.5;
 
 /// Share of the keyframe's points in view below which the view is prepared ahead: a camera that pans at 90°/s loses a
-/// twentieth of its image a frame, and depth is too little from a third to a tenth on.
+/// twentieth of its image per frame, and from a third to a tenth on there is too little depth.
 const AHEAD_IN_VIEW: f64 = 0.5;
 
-/// The view that frames are aligned to, and the frame before.
+/// The view that frames are aligned to, and the previous frame.
 #[derive(Debug)]
 pub(super) struct Turning {
     pub(super) unknown: UnknownDepth,
-    /// Expects about the same exposure.
+    /// Has a prior of about the same exposure.
     aligner: Aligner,
-    /// Lent while a frame is aligned to it.
+    /// Taken out while a frame is aligned to it.
     view: Option<Box<Reference>>,
     place: Option<Place>,
-    /// Whether no frame has been held to it: the motion is that on the keyframe's last points.
+    /// Whether no frame has been held to it yet: the motion is that from the keyframe's last points.
     is_first: bool,
-    /// How well the last one fitted on the coarsest level.
+    /// Fit of the last held frame on the coarsest level.
     coarse_fit: Option<f64>,
-    /// The frame before.
+    /// The previous frame.
     before: SumPyramid,
-    /// What is where.
+    /// Which frame is in which buffer.
     frames: Frames,
     /// Whether the frame in the tracker's pyramid is to be the view.
     is_due: bool,
 }
 
-/// Sequences of the frames that are kept: in the tracker's pyramid, before it, and in the view.
+/// Sequences of the stored frames: in the tracker's pyramid, before it, and in the view.
 #[derive(Debug, Clone, Copy, Default)]
 struct Frames {
     filled: Option<u64>,
@@ -98,32 +98,32 @@ struct Frames {
     view: Option<u64>,
 }
 
-/// What is put aside while a frame is rehearsed.
+/// State that is saved while a frame is rehearsed.
 pub(super) struct Paused {
     place: Option<Place>,
     frames: Frames,
 }
 
-/// Where the view is.
+/// Pose of the view.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {
     /// In units of the mean depth.
     world_from_view: Sim3,
-    /// Time from the last keyframe's to the view, seconds.
+    /// Time from the last frame tracked on the keyframe to the view, seconds.
     since_secs: f64,
-    /// How long the keyframe's points would have been in view since, seconds.
+    /// For how long the keyframe's points would have been in view since, seconds.
     in_view_secs: f64,
     /// Stamp of the view.
     nanos: i64,
-    /// How fast the camera may move, mean depths a second.
+    /// Possible speed of the camera, mean depths per second.
     speed: f64,
-    /// Of the left increment of `view_from_keyframe`, in the same units.
+    /// Covariance of the left increment of `view_from_keyframe`, in the same units.
     covariance: Matrix6<f64>,
 }
 
 impl Place {
-    /// Variance of how far the camera has gone from here at `since_secs`. It moves on evenly: the distance grows with the
-    /// time, not with the root of it.
+    /// Variance of the camera's distance from here at `since_secs`. It moves evenly: the distance grows with the time,
+    /// not with its square root.
     fn distance_variance(&self, since_secs: f64) -> f64 {
         self.speed.powi(2) * (since_secs.powi(2) - self.since_secs.powi(2))
     }
@@ -162,13 +162,13 @@ impl Turning {
         }
     }
 
-    /// Keeps the frame in `pyramid`, into which another will be filled.
+    /// Keeps the frame in `pyramid`, which is about to be overwritten.
     pub(super) fn keep(&mut self, pyramid: &mut SumPyramid, sequence: u64) {
         std::mem::swap(&mut self.before, pyramid);
         self.frames.before = self.frames.filled.replace(sequence);
     }
 
-    /// Makes the frame in `pyramid` the view, where it is to be that; what was in the view is left in its place.
+    /// Makes the frame in `pyramid` the view, if that is due; the contents of the old view are left in its place.
     pub(super) fn prepare(&mut self, intrinsics: &Intrinsics, pyramid: &mut SumPyramid) {
         if !std::mem::take(&mut self.is_due) {
             return;
@@ -178,40 +178,40 @@ impl Turning {
         self.frames.view = self.frames.filled.take();
     }
 
-    /// A frame with a pose was tracked on a keyframe: where the next one may have left its depth the view is prepared ahead.
+    /// After a frame with a pose on a keyframe: schedules the view where the next frame may leave the known depth.
     pub(super) fn look_ahead(&mut self, estimate: &PoseEstimate, may_be_next: bool) {
         let is_at_edge = estimate.quality.in_view_ratio < AHEAD_IN_VIEW;
         self.is_due = may_be_next && estimate.state.is_tracked() && is_at_edge;
     }
 
-    /// Before a frame is rehearsed: nothing is held meanwhile.
+    /// Saves the state before a frame is rehearsed: nothing is held meanwhile.
     pub(super) fn pause(&mut self) -> Paused {
         Paused { place: self.place.take(), frames: std::mem::take(&mut self.frames) }
     }
 
-    /// After it: `pyramid` was filled once more.
+    /// Restores the state afterwards: `pyramid` was filled once more.
     pub(super) fn resume(&mut self, paused: Paused, pyramid: &mut SumPyramid) {
         std::mem::swap(&mut self.before, pyramid);
         (self.place, self.frames) = (paused.place, paused.frames);
         self.is_due = false;
     }
 
-    /// The frame of `estimate` is to be the next view.
+    /// Makes the frame of `estimate` the next view.
     fn take_over(&mut self, estimate: &PoseEstimate, place: Place) {
         self.is_first = false;
-        // Frames that follow each other are blurred alike, and show nearly the same.
+        // Consecutive frames are blurred alike, and show nearly the same.
         self.is_due = true;
         let world_from_view = Sim3::new(estimate.world_from_camera, place.world_from_view.scale);
         self.place = Some(Place { world_from_view, nanos: estimate.capture_nanos, ..place });
     }
 
-    /// The keyframe fits again, or nothing does; whether a view was held.
+    /// Ends the hold as the keyframe fits again, or nothing does; returns whether a view was held.
     pub(super) fn end(&mut self) -> bool {
         self.is_due = false;
         self.place.take().is_some()
     }
 
-    /// The keyframe that poses are known from has been moved.
+    /// Moves the view with the keyframe that poses are relative to.
     pub(super) fn follow(&mut self, before: &Sim3, after: &Sim3) {
         if let Some(place) = self.place.as_mut().filter(|_| before != after) {
             place.world_from_view = *after * before.inverse() * place.world_from_view;
@@ -220,7 +220,7 @@ impl Turning {
 }
 
 impl Tracker {
-    /// Holds a frame that was lost on `reference` to the view before. `before` is what was remembered then.
+    /// Holds a frame that was lost on `reference` to the previous view. `before` is the memory before the loss.
     pub(super) fn turn(
         &mut self,
         reference: &Reference,
@@ -254,7 +254,7 @@ impl Tracker {
         let Some((estimate, covariance)) = estimate else {
             self.memory = lost;
             if is_cut_short && (0.0..MOST_SECONDS).contains(&since_view) {
-                // It says nothing: the view waits for the next one, of which the same is expected.
+                // This frame tells nothing: the view waits for the next one, of which the same motion is expected.
                 self.memory.motion = before.motion.clone();
             } else {
                 self.end_turning();
@@ -264,7 +264,7 @@ impl Tracker {
         self.memory.motion.observe(frame.capture_nanos, &estimate.world_from_camera);
         self.memory.brightness = Brightness::default();
         self.memory.coarse_fit = before.coarse_fit;
-        // One that was cut short is no view for the next: its error would stay.
+        // A frame that was cut short does not become the view: its error would persist.
         if !is_cut_short {
             self.turning.coarse_fit = coarse_fit;
             self.turning.take_over(&estimate, Place { covariance, ..next });
@@ -272,20 +272,20 @@ impl Tracker {
         Some(estimate)
     }
 
-    /// Remembers what was before the loss, as it is expected of the next frame on the view; what the loss has left.
+    /// Restores the memory before the loss, as needed for the frame on the view; returns that after the loss.
     fn recall(&mut self, before: &Memory) -> Memory {
         let held = Memory {
             last_sequence: self.memory.last_sequence,
             brightness: Brightness::default(),
             coarse_fit: self.turning.coarse_fit,
-            // The motion on the keyframe's last points may be anything.
+            // The motion from the keyframe's last points may be anything.
             was_lost: self.turning.is_first,
             ..before.clone()
         };
         std::mem::replace(&mut self.memory, held)
     }
 
-    /// Whether a keyframe's points would be in view from where a view holds the camera: it has not turned away from them then,
+    /// Whether a keyframe's points would be in view from the held pose: then the camera has not rotated away from them,
     /// and something else hides them.
     fn sees(&self, reference: &Reference, held: &PoseEstimate) -> bool {
         let (aligner, pyramid) = (&self.aligner, &self.pyramid);
@@ -294,8 +294,8 @@ impl Tracker {
         seen.in_view_ratio >= self.params.verdict.degraded_in_view
     }
 
-    /// Whether a pose found at `nanos` is turned against the one that a view holds by more than that is uncertain and the
-    /// camera turns meanwhile: it looks like what the keyframe shows, and is elsewhere.
+    /// Whether a pose found at `nanos` is rotated against the held one by more than the uncertainty and the camera's
+    /// rotation meanwhile: it resembles the keyframe's view, but is elsewhere.
     pub(super) fn contradicts_hold(&self, nanos: i64, world_from_camera: &SE3) -> bool {
         /// A frame at 30 Hz, seconds.
         const INTERVAL: f64 = 1.0 / 30.0;
@@ -310,15 +310,15 @@ impl Tracker {
             > MOST_CHANGE_RAD * intervals.max(1.0) + MOST_DEVIATIONS * uncertain
     }
 
-    /// No view holds the camera from here on.
+    /// Ends the hold of a view.
     pub(super) fn end_turning(&mut self) {
         if self.turning.end() {
-            // The motion from where it was held to where it is was made in one frame of no camera.
+            // The jump from the held pose to the actual one in one frame is no motion of a camera.
             self.memory.motion.stop();
         }
     }
 
-    /// Takes the frame before for the view, where it had a pose.
+    /// Makes the previous frame the view, if it had a pose.
     fn begin_turning(&mut self, before: &Memory, unit: f64) {
         let Self { turning, intrinsics, .. } = self;
         let Some(last) = before.last_sequence.filter(|_| !before.was_lost) else { return };
@@ -337,7 +337,7 @@ impl Tracker {
         }
         let mut covariance = full_covariance(&before.covariance);
         scale_translation(&mut covariance, before.unit / unit);
-        // As fast as it was.
+        // No slower than it was.
         let speed = before.motion.speed().map_or(SPEED, |speed| SPEED.max(speed / unit));
         let world_from_view = Sim3::new(world_from_camera, unit);
         (turning.is_first, turning.coarse_fit) = (true, None);
@@ -351,8 +351,8 @@ impl Tracker {
         });
     }
 
-    /// The estimate of a frame that is aligned to the view, and the covariance in units of the mean depth; `None` where
-    /// it does not fit as well as after a loss, or its translation is not known any more.
+    /// The estimate of a frame aligned to the view, and the covariance in units of the mean depth; `None` where it does
+    /// not fit as well as after a loss, or its translation is too uncertain.
     fn held(
         &self,
         reference: &Reference,
@@ -368,7 +368,7 @@ impl Tracker {
         if !self.fits_view(view, alignment, &quality, &expected) {
             return None;
         }
-        // What turns and what moves look alike over a step: added up, translations would run away by a scene in seconds.
+        // Rotation and translation look alike over a step: summed up, translations would drift by a scene in seconds.
         let rotation = alignment.state.current_from_keyframe.rotation;
         let current_from_view = SE3 { rotation, ..SE3::identity() };
         let of_step =
@@ -377,7 +377,7 @@ impl Tracker {
         let covariance = of_step + adjoint * place.covariance * adjoint.transpose();
         let translation: Matrix3<f64> = covariance.fixed_view::<3, 3>(0, 0).into_owned();
         let deviation = translation.symmetric_eigenvalues().max().sqrt();
-        // A comparison that is false of what is no number.
+        // This comparison also rejects NaN.
         if !(deviation <= self.params.max_turning_deviation) {
             return None;
         }
@@ -406,7 +406,7 @@ impl Tracker {
         Some((estimate, covariance))
     }
 
-    /// Quality of an alignment to the view, with what a step that was cut short may be off.
+    /// Quality of an alignment to the view, including the possible error of one that was cut short.
     fn quality_on_view(&self, view: &Reference, alignment: &Alignment) -> Quality {
         let mut quality = self.quality(alignment);
         if alignment.ending == Ending::OutOfBudget {
@@ -416,7 +416,7 @@ impl Tracker {
         quality
     }
 
-    /// Whether a frame fits the view as well as after a loss, and turns about as `expected`.
+    /// Whether a frame fits the view as well as after a loss, and its rotation is about as `expected`.
     fn fits_view(
         &self,
         view: &Reference,
@@ -431,7 +431,7 @@ impl Tracker {
                 TrackingState::Tracking
                     | TrackingState::Degraded(DegradedReason::LowOverlap | DegradedReason::Budget)
             );
-        // By the image's noise alone: parallax that the uncertain depth would explain is no rotation.
+        // By image noise alone: parallax that the uncertain depth would explain is not a rotation.
         let explained = self.aligner.explanation(view, &self.pyramid, alignment);
         let inliers = f64::from(explained.inliers) / f64::from(explained.compared.max(1));
         let is_even = alignment.state.brightness.a.abs() <= MOST_GAIN;
@@ -440,8 +440,8 @@ impl Tracker {
         is_smooth && is_seen && inliers >= LEAST_INLIERS && is_even
     }
 
-    /// Covariance of the step from the view, units of the mean depth: of the rotation as it was measured, of the
-    /// translation as far as a hand moves; `None` where the rotation is not known.
+    /// Covariance of the step from the view, units of the mean depth: of the rotation as measured, of the translation
+    /// as far as a hand moves; `None` where the rotation is too uncertain.
     fn step_covariance(
         &self,
         view: &Reference,
@@ -456,20 +456,20 @@ impl Tracker {
         of_step.fixed_view_mut::<3, 6>(0, 0).fill(0.0);
         of_step.fixed_view_mut::<6, 3>(0, 0).fill(0.0);
         (0..3).for_each(|axis| of_step[(axis, axis)] = distance_variance);
-        // A comparison that is false of what is no number.
+        // This comparison also rejects NaN.
         (rotation_std_dev(&of_step) <= MOST_ROTATION_STD_DEV).then_some(of_step)
     }
 }
 
-/// What of a pose's covariance comes from where the camera has gone in truth while the prior held it at the view:
-/// M⁻¹ Λ Σ Λ M⁻¹, Λ the information of the prior.
+/// Part of a pose's covariance that is due to the camera's true motion while the prior held it at the view: M⁻¹ Λ Σ Λ
+/// M⁻¹, Λ the information of the prior.
 fn from_prior(alignment: &Alignment, information: f64, variance: f64) -> Option<Matrix6<f64>> {
     let inverse = alignment.state.sums.information.cholesky()?.inverse();
     let moved = inverse.fixed_view::<6, 3>(0, 0).into_owned() * information;
     Some(moved * moved.transpose() * variance)
 }
 
-/// Whether a frame that was lost for this reason may be held to the view before.
+/// Whether a frame that was lost for this reason may be held to the previous view.
 pub(super) fn may_turn(state: TrackingState) -> bool {
     use LostReason::{Diverged, NoPoints, TooFewInliers};
     matches!(state, TrackingState::Lost(Diverged | TooFewInliers | NoPoints))

@@ -1,4 +1,4 @@
-//! A camera that pans on from the depth that is known, in the room of the tests.
+//! A camera that pans beyond the known depth, in the room of the tests.
 
 use nalgebra::Vector6;
 
@@ -14,7 +14,7 @@ use crate::slam::tracker::{Tracker, TrackerParams};
 
 const TURNING: TrackingState = TrackingState::Degraded(DegradedReason::Turning);
 
-/// Where a camera stands that pans by 2.5° a frame and is carried along by so many metres.
+/// Pose of a camera that pans by 2.5° and moves by so many metres per frame.
 fn panned(frame: u64, metres_a_frame: f64) -> SE3 {
     let frames = frame as f64;
     let angle = 2.5f64.to_radians() * frames;
@@ -23,7 +23,7 @@ fn panned(frame: u64, metres_a_frame: f64) -> SE3 {
     pose
 }
 
-/// What is said of a pan of so many frames.
+/// Estimates of a pan over so many frames.
 fn pan(params: TrackerParams, frames: u64, metres_a_frame: f64) -> Vec<PoseEstimate> {
     let scene = Scene::new(3);
     let mut tracker = Tracker::new(CAMERA, params).unwrap();
@@ -37,7 +37,7 @@ fn pan(params: TrackerParams, frames: u64, metres_a_frame: f64) -> Vec<PoseEstim
 }
 
 #[test]
-fn a_pan_away_from_all_depth_is_held_with_a_covariance_that_is_honest() {
+fn a_pan_away_from_all_depth_is_held_with_a_realistic_covariance() {
     const FRAMES: u64 = 40;
     for metres_a_frame in [0.0, 0.004] {
         let said = pan(TrackerParams::default(), FRAMES, metres_a_frame);
@@ -58,7 +58,7 @@ fn a_pan_away_from_all_depth_is_held_with_a_covariance_that_is_honest() {
         // Of six degrees of freedom 99.9 % are below.
         assert!(worst < 22.5, "{metres_a_frame}: {worst}");
         let deviation = |of: &PoseEstimate| of.covariance[0].sqrt();
-        // Where there is no parallax the camera has not moved, and noise adds up; a path has the error of its depth.
+        // Without parallax the camera has not moved, and noise adds up; a path has the error of its depth.
         let path = metres_a_frame * FRAMES as f64 / 4.0;
         let least = f64::max(2.0 * deviation(&said[3]), 0.3 * path);
         let last = deviation(said.last().unwrap());
@@ -66,7 +66,7 @@ fn a_pan_away_from_all_depth_is_held_with_a_covariance_that_is_honest() {
     }
 }
 
-/// As [`pan`] at constant pace with a jerk to the side in one frame, in which there is time for no iteration.
+/// Like [`pan`] at constant pace, with a sideways jerk in one frame, for which there is no time for an iteration.
 fn pan_cut_short(frames: u64, cut_short: u64, jerk_rad: f64) -> Vec<(SE3, PoseEstimate)> {
     let scene = Scene::new(3);
     let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
@@ -82,9 +82,9 @@ fn pan_cut_short(frames: u64, cut_short: u64, jerk_rad: f64) -> Vec<(SE3, PoseEs
 }
 
 #[test]
-fn a_held_frame_that_is_cut_short_ends_nothing() {
+fn a_held_frame_that_is_cut_short_does_not_end_the_hold() {
     const CUT_SHORT: u64 = 25;
-    // Where the motion is even the pose expected fits; else nothing is said of this frame alone.
+    // Where the motion is even the predicted pose fits; otherwise only this frame has no pose.
     for (jerk_rad, state) in
         [(0.0, TURNING), (0.06, TrackingState::Lost(LostReason::TooFewInliers))]
     {
@@ -101,13 +101,13 @@ fn a_held_frame_that_is_cut_short_ends_nothing() {
             let rotation = error.fixed_rows::<3>(3).norm();
             assert!(rotation < 0.06, "{jerk_rad}: frame {frame}: {rotation}");
         }
-        // Less sure than the frames beside it.
+        // Less certain than the adjacent frames.
         let deviation = |frame: u64| at(frame).covariance[20].sqrt();
         assert!(deviation(CUT_SHORT) > 1.5 * deviation(CUT_SHORT + 1), "{jerk_rad}");
     }
 }
 
-/// What is said of a pan by so many degrees a frame; after frame `at` the tracker gets another keyframe.
+/// States of a pan by so many degrees per frame; after frame `at` the tracker gets another keyframe.
 fn pan_with(degrees: f64, frames: u64, at: u64, other: &Keyframe) -> Vec<TrackingState> {
     let scene = Scene::new(3);
     let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
@@ -127,8 +127,8 @@ fn pan_with(degrees: f64, frames: u64, at: u64, other: &Keyframe) -> Vec<Trackin
 }
 
 #[test]
-fn what_hides_a_keyframe_without_a_turn_is_not_held_for_long() {
-    // The keyframe shows another room at the same place.
+fn a_keyframe_hidden_without_a_rotation_is_not_held_for_long() {
+    // The keyframe shows another room at the same pose.
     let other = Scene::new(9).keyframe(2, SE3::identity(), 2.0);
     let said = pan_with(0.3, 40, 3, &other);
     let held = said.iter().filter(|&&state| state == TURNING).count();
@@ -137,7 +137,7 @@ fn what_hides_a_keyframe_without_a_turn_is_not_held_for_long() {
 }
 
 #[test]
-fn a_find_that_is_turned_against_what_is_held_is_refused() {
+fn a_find_that_is_rotated_against_the_held_pose_is_refused() {
     const AT: u64 = 24;
     let found = Scene::new(3).keyframe(2, panned(AT, 0.0), 2.0);
     let turned = Sim3::exp(&Twist7::from([0.0, 0.0, 0.0, 0.0, 0.0, 0.7, 0.0]));
@@ -154,7 +154,7 @@ fn a_find_that_is_turned_against_what_is_held_is_refused() {
 }
 
 #[test]
-fn what_is_prepared_after_a_frame_changes_no_bit() {
+fn preparing_ahead_changes_no_bit() {
     let scene = Scene::new(3);
     let run = |is_prepared: bool| {
         let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
@@ -176,12 +176,12 @@ fn what_is_prepared_after_a_frame_changes_no_bit() {
 }
 
 #[test]
-fn nothing_is_held_where_that_is_switched_off_or_after_a_frame_that_was_lost() {
+fn nothing_is_held_when_switched_off_or_after_a_lost_frame() {
     let off = TrackerParams { max_turning_deviation: 0.0, ..TrackerParams::default() };
     let said = pan(off, 40, 0.0);
     assert!(said.iter().all(|estimate| estimate.state != TURNING));
     assert!(!said.last().unwrap().state.is_tracked());
-    // As far as the translation may be unknown, and no further.
+    // As long as the translation is certain enough, and no longer.
     let short = TrackerParams { max_turning_deviation: 0.05, ..TrackerParams::default() };
     let said = pan(short, 40, 0.0);
     let last_held = said.iter().rposition(|estimate| estimate.state == TURNING).unwrap();

@@ -1,16 +1,16 @@
-//! How fast the camera moves: the step from the pose before, and how uncertain that is.
+//! Velocity of the camera: the step from the previous pose, and its covariance.
 //!
 //! ```text
 //! v = log(T₀⁻¹ T₁) / Δt          T = world_from_camera of the last two frames that were tracked, Δt between their stamps
 //! Σ_v = (A N₀ Aᵀ + N₁ + (A J₀ − J₁) P (A J₀ − J₁)ᵀ) / Δt² + (a Δt / 2)² I          A = Ad((T₀⁻¹ T₁)⁻¹)
 //! N = OWN_SHARE (Σ_alignment + Σ_displacement)
 //! ```
-//! N are the errors that each pose has for itself: a part of those of its alignment and of the displacement of its image, since
-//! noise of single points' depth, lens and rolling shutter displace successive images alike. The common errors of the
-//! keyframe's depth, m with covariance P, move both poses: by J₀ m and J₁ m, whose difference is a relative error of the
-//! velocity. Across a change of keyframe the errors of depth, of points and common, are others. v is a mean over the interval: until
-//! its end the camera accelerates on by a Δt / 2, a from how v changed over the last intervals. Errors of a pose are those of
-//! the left increment of `current_from_keyframe`; the velocity is in the camera's axes, in which a steady turn is steady.
+//! N are the independent errors of each pose: a part of those of its alignment and of the displacement of its image,
+//! since noise of single points' depth, lens and rolling shutter displace successive images alike. The common errors of
+//! the keyframe's depth, m with covariance P, move both poses: by J₀ m and J₁ m, whose difference is a relative error
+//! of the velocity. Across a change of keyframe the errors of depth, of points and common, differ. v is a mean over the
+//! interval: by its end v has changed by a further a Δt / 2, a from its last changes. Errors of a pose are those of the
+//! left increment of `current_from_keyframe`; the velocity is in the camera's axes, in which a steady turn is constant.
 
 use nalgebra::{Matrix6, Matrix6x3, Vector6};
 
@@ -18,30 +18,30 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::pose::{Velocity, upper_triangle};
 
-/// Longest interval that has a velocity, seconds: what a camera does in more is no steady motion.
+/// Longest interval that has a velocity, seconds: over a longer one no motion is steady.
 const LONGEST_INTERVAL: f64 = 0.5;
 
-/// Part of a pose's variance that the pose before it on the same keyframe does not share. Calibrated on exact and recorded
-/// sequences: what poses differ by from frame to frame is half of what they are uncertain by, and less on exact images.
+/// Share of a pose's variance that is independent of the previous pose on the same keyframe. Calibrated on exact and
+/// recorded sequences: poses differ from frame to frame by half of their uncertainty, and by less on exact images.
 const OWN_SHARE: f64 = 0.25;
 
-/// Share of the newest change in the mean over the last ones: a quarter of a second at 30 Hz.
+/// Weight of the newest change in the running mean: a quarter of a second at 30 Hz.
 const NEWEST_SHARE: f64 = 0.125;
 
-/// What the common depth of a keyframe and noise make of one pose, keyframe units and radians.
+/// Errors of one pose from noise and the keyframe's common depth, keyframe units and radians.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct PoseErrors {
-    /// Keyframe and epoch that the pose is known from.
+    /// Keyframe and epoch that the pose is relative to.
     pub keyframe: (u64, u32),
-    /// World units of a keyframe unit.
+    /// World units per keyframe unit.
     pub unit: f64,
     /// Covariance of the alignment.
     pub alignment: Matrix6<f64>,
     /// Covariance of the displacement of the whole image.
     pub displacement: Matrix6<f64>,
-    /// J: by what the pose moves for each common error of depth.
+    /// J: motion of the pose per unit of each common error of depth.
     pub by_mode: Matrix6x3<f64>,
-    /// P: covariance of these.
+    /// P: covariance of these errors.
     pub modes: ModeCovariance,
 }
 
@@ -52,7 +52,7 @@ impl PoseErrors {
     }
 }
 
-/// What a tracker keeps of the frames before for the velocity of the next.
+/// State of the previous frames, for the velocity of the next.
 #[derive(Debug, Clone, Default)]
 pub(super) struct VelocityMemory {
     last: Option<PoseErrors>,
@@ -63,7 +63,7 @@ pub(super) struct VelocityMemory {
 /// A mean velocity.
 #[derive(Debug, Clone, Copy)]
 struct Step {
-    /// World units and radians a second.
+    /// World units and radians per second.
     velocity: Vector6<f64>,
     secs: f64,
     /// Sum of the variances of the translation, and of the rotation, without acceleration.
@@ -71,12 +71,12 @@ struct Step {
 }
 
 impl VelocityMemory {
-    /// There is no pose, or none that the next one follows from.
+    /// Forgets everything: there is no pose, or none from which the next one follows.
     pub fn forget(&mut self) {
         *self = Self::default();
     }
 
-    /// The map's unit is `factor` times what it was.
+    /// Rescales as the map's unit changes by `factor`.
     pub fn follow(&mut self, factor: f64) {
         if let Some(last) = &mut self.last {
             last.unit *= factor;
@@ -90,8 +90,8 @@ impl VelocityMemory {
         }
     }
 
-    /// The velocity at a frame with these errors that came by `twist`, world units and radians, from the one before, in
-    /// `secs` seconds; `None` where that is not known, or there is no velocity.
+    /// The velocity at a frame with these errors after a `motion` (twist in world units and radians, duration in
+    /// seconds) from the previous one; `None` where the motion is unknown, or there is no velocity.
     pub fn observe(
         &mut self,
         errors: PoseErrors,
@@ -122,17 +122,17 @@ impl VelocityMemory {
         numbers.all(|x| x.is_finite()).then_some(velocity)
     }
 
-    /// Variance of each axis of the translation, and of the rotation, of what a velocity may change by from the middle of its
-    /// interval to the end.
+    /// Variance, per axis of the translation and of the rotation, of the possible change of a velocity from the middle
+    /// of its interval to the end.
     fn change(&mut self, now: &Step) -> [f64; 2] {
         let half = 0.5 * now.secs;
-        // The first step may be the camera's first as well.
+        // The first step may also be the camera's first motion.
         let begun = [0, 3].map(|start| now.velocity.fixed_rows::<3>(start).norm_squared() / 3.0);
         let Some(before) = self.step else { return begun };
         let between = 0.5 * (before.secs + now.secs);
         let acceleration = (now.velocity - before.velocity) / between;
         let newest = [0, 1].map(|part| {
-            // Both have the pose between them: its error counts four times, those at the ends once.
+            // Both share the pose between them: its error counts four times, those at the ends once.
             let noise = 1.5 * (before.variance[part] + now.variance[part]) / (between * between);
             (acceleration.fixed_rows::<3>(3 * part).norm_squared() - noise) / 3.0
         });

@@ -1,4 +1,4 @@
-//! Velocities of a camera on a known path, of errors as they were said, and where there is none.
+//! Velocities of a camera on a known path, with errors as reported, and cases without a velocity.
 
 use nalgebra::{Matrix6, Matrix6x3, Vector3, Vector6};
 
@@ -19,7 +19,7 @@ const INTERVAL: f64 = 1.0 / 30.0;
 /// Of six degrees of freedom 99.9 % are below.
 const RARE: f64 = 22.5;
 
-/// What the camera does in a frame, steadily.
+/// The camera's steady motion per frame.
 fn step() -> Vector6<f64> {
     Vector6::new(0.010, -0.004, 0.007, 0.003, 0.004, -0.005)
 }
@@ -81,7 +81,7 @@ fn normalized(velocity: &Velocity, exact: &Vector6<f64>) -> f64 {
 }
 
 #[test]
-fn a_steady_camera_has_its_velocity_within_what_is_said() {
+fn a_steady_camera_has_its_velocity_within_the_covariance() {
     let mut camera = Camera::on(&keyframe());
     assert_eq!(camera.see(0), None, "there is no pose before the first");
     for index in 1..=12 {
@@ -112,7 +112,7 @@ fn there_is_no_velocity_without_two_poses_in_a_row() {
 }
 
 #[test]
-fn there_is_no_velocity_across_epochs_and_on_a_map_that_was_rejected() {
+fn there_is_no_velocity_across_epochs_and_on_a_rejected_map() {
     let mut camera = Camera::on(&keyframe());
     assert_eq!([0, 1].map(|index| camera.see(index).is_some()), [false, true]);
     let next = Keyframe { keyframe_id: 7, epoch: 1, sequence: 1, ..keyframe() };
@@ -125,7 +125,7 @@ fn there_is_no_velocity_across_epochs_and_on_a_map_that_was_rejected() {
     assert_eq!(camera.tracker.track(&frame, &mut |_| true).velocity, None);
 }
 
-/// The map's unit is scaled between two frames, and the keyframe stands elsewhere.
+/// The map's unit is scaled between two frames, and the keyframe moves.
 #[test]
 fn velocity_follows_the_unit_of_the_map() {
     let with_unit = |unit: f64| {
@@ -147,10 +147,10 @@ fn velocity_follows_the_unit_of_the_map() {
     }
 }
 
-/// Poses with errors of their own, with those that all poses on a keyframe have, and with those of its common depth.
+/// Poses with independent errors, with errors shared by all poses on a keyframe, and with those of its common depth.
 struct Errors {
     noise: Noise,
-    /// Standard deviation of each pose; a quarter of its variance is each pose's own.
+    /// Standard deviation of each pose; a quarter of its variance is independent.
     of_pose: Vector6<f64>,
     shared: Vector6<f64>,
     modes: ModeCovariance,
@@ -158,7 +158,7 @@ struct Errors {
 }
 
 impl Errors {
-    /// With this share of the motion lost to the keyframe's depth, a standard deviation.
+    /// `of_depth` is the standard deviation of the share of the motion lost to the keyframe's depth.
     fn new(seed: u64, of_depth: f64) -> Self {
         let modes = ModeCovariance::of_std_devs([of_depth; 3]);
         let of_pose = Vector6::new(8e-4, 6e-4, 12e-4, 4e-4, 6e-4, 2e-4);
@@ -168,7 +168,7 @@ impl Errors {
         Self { noise, of_pose, shared, modes, of_keyframe }
     }
 
-    /// What a camera at a true pose is taken for: its estimate, and how that errs.
+    /// The estimate of a camera at a true pose, and its errors.
     fn of(&mut self, index: u64) -> (SE3, PoseErrors) {
         let current_from_keyframe = path(index).inverse();
         // A common error of depth scales the translation.
@@ -190,7 +190,7 @@ impl Errors {
     }
 }
 
-/// Mean normalised error of the velocities of runs of twenty frames, and of those the mean variance along z.
+/// Mean normalised error of the velocities in runs of twenty frames, and their mean variance along z.
 fn monte_carlo(of_depth: f64) -> (f64, f64) {
     const RUNS: u64 = 300;
     const FRAMES: u64 = 20;
@@ -203,7 +203,7 @@ fn monte_carlo(of_depth: f64) -> (f64, f64) {
             let (world_from_camera, error) = errors.of(index);
             let motion = before.replace(world_from_camera);
             let motion = motion.map(|last| ((last.inverse() * world_from_camera).log(), INTERVAL));
-            // The first steps hold that the camera may have begun to move.
+            // The first steps include the variance of a camera that may just have started to move.
             let velocity = memory.observe(error, motion).filter(|_| index > 1);
             sum += velocity.map_or(0.0, |velocity| normalized(&velocity, &(step() / INTERVAL)));
             variance += velocity.map_or(0.0, |velocity| velocity.covariance[11]);
@@ -214,12 +214,12 @@ fn monte_carlo(of_depth: f64) -> (f64, f64) {
 }
 
 #[test]
-fn errors_that_two_poses_share_cancel_and_their_own_count_twice() {
+fn shared_errors_of_two_poses_cancel_and_independent_ones_count_twice() {
     for of_depth in [0.0, 0.02, 0.1] {
         let (error, variance) = monte_carlo(of_depth);
-        // Steady motion is never sure to be steady: somewhat below 6.
+        // Steady motion is never certain to be steady: somewhat below 6.
         assert!((3.0..6.5).contains(&error), "{of_depth}: {error}");
-        // As if the poses' common errors were independent it were that of the whole path, not of a step.
+        // If the poses' common errors were independent it would be that of the whole path, not of a step.
         let of_noise = 2.0 * 6e-4f64.powi(2);
         let of_step = 3.0 * (of_depth * step()[2]).powi(2);
         let expected = (of_noise + of_step) / (INTERVAL * INTERVAL);
@@ -228,7 +228,7 @@ fn errors_that_two_poses_share_cancel_and_their_own_count_twice() {
 }
 
 #[test]
-fn points_of_another_keyframe_have_errors_of_their_own() {
+fn points_of_another_keyframe_have_independent_errors() {
     let variance = |keyframe: u64| {
         let mut memory = VelocityMemory::default();
         let mut errors = Errors::new(1, 0.0);
@@ -244,8 +244,8 @@ fn points_of_another_keyframe_have_errors_of_their_own() {
 }
 
 #[test]
-fn a_camera_that_changes_its_velocity_is_less_sure_of_it() {
-    // Each frame moves by a third more than the one before.
+fn a_changing_velocity_is_less_certain() {
+    // Each frame moves by a third more than the previous one.
     let deviation = |accelerates: bool| {
         let mut memory = VelocityMemory::default();
         let mut errors = Errors::new(1, 0.0);
@@ -259,6 +259,6 @@ fn a_camera_that_changes_its_velocity_is_less_sure_of_it() {
         (velocity.covariance[0].sqrt(), velocity.linear.norm())
     };
     let ((steady, _), (unsteady, speed)) = (deviation(false), deviation(true));
-    // From the middle of its last interval it gained an eighth of its speed, in three axes together.
+    // From the middle of its last interval it gained an eighth of its speed, over three axes together.
     assert!(unsteady > steady + 0.03 * speed, "{steady} {unsteady} {speed}");
 }

@@ -11,21 +11,21 @@ use crate::slam::pose::{DegradedReason, LostReason, Quality, TrackingState};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VerdictParams {
-    /// Fewest points in view and not clipped by the sensor, at the level solved: eight unknowns need many times as many.
+    /// Fewest points in view and not clipped by the sensor, at the level solved: eight unknowns need many times more.
     pub min_points: u32,
     /// Share of points in view and not clipped by the sensor below which a frame is lost.
     pub lost_in_view: f64,
     /// Share of inliers among those below which a frame is lost.
     pub lost_inliers: f64,
-    /// What `lost_inliers` rises by until a lost tracker may claim a pose again: a wrong pose must not pass by chance.
-    /// Wrong places on recordings had up to 0.85 of inliers, most of them below 0.78; nor may a pose be claimed then
+    /// Increase of `lost_inliers` until a lost tracker may claim a pose again: a wrong pose must not pass by chance.
+    /// Wrong poses on recordings had up to 0.85 of inliers, most of them below 0.78; nor may a pose be claimed then
     /// that would be degraded for its overlap.
     pub recovery_margin: f64,
-    /// Farthest from the keyframe that a lost tracker may claim a pose, keyframe units (mean depths): from afar the depth
-    /// variance explains any image. Keyframes are made at a third; wrong places were 0.4 to 0.9 away.
+    /// Largest distance from the keyframe at which a lost tracker may claim a pose, keyframe units (mean depths): from
+    /// afar the depth variance explains any image. Keyframes are created at a third; wrong poses were 0.4 to 0.9 away.
     pub recovery_distance: f64,
     /// Largest logarithm of the gain, either way, with which a lost tracker may claim a pose: a small gain flattens any
-    /// image. Where the camera was before, automatic exposure is about what it was; wrong places had 0.7 to 1.
+    /// image. Where the camera has been before, automatic exposure is about as it was; wrong poses had 0.7 to 1.
     pub recovery_gain: f64,
     /// Share of points in view and not clipped by the sensor below which a pose is degraded.
     pub degraded_in_view: f64,
@@ -65,7 +65,7 @@ impl VerdictParams {
         check_range("gap_frames", self.gap_frames, 0..=1_000_000)
     }
 
-    /// Judges an alignment. `was_lost`: whether the frame before was; `missing`: frames between.
+    /// Judges an alignment. `was_lost`: whether the previous frame was lost; `missing`: number of frames in between.
     pub fn judge(
         &self,
         alignment: &Alignment,
@@ -100,13 +100,13 @@ impl VerdictParams {
         }
     }
 
-    /// Whether place and brightness are such as a camera that is found again has.
+    /// Whether position and brightness are plausible for a camera that is found again.
     pub fn is_near(&self, alignment: &Alignment) -> bool {
         alignment.state.current_from_keyframe.translation.norm() <= self.recovery_distance
             && self.has_likely_gain(alignment)
     }
 
-    /// Whether the brightness is such.
+    /// Whether the brightness is plausible.
     pub fn has_likely_gain(&self, alignment: &Alignment) -> bool {
         alignment.state.brightness.a.abs() <= self.recovery_gain
     }
@@ -116,7 +116,7 @@ impl VerdictParams {
 pub fn quality_of(alignment: &Alignment) -> Quality {
     let sums = &alignment.state.sums;
     let compared = f64::from(sums.compared).max(1.0);
-    // One that was cut short stands on the finest level, but was solved on coarser ones at most.
+    // One that was cut short is evaluated on the finest level, but was solved on coarser ones at most.
     let iterations = &alignment.iterations;
     let solved = iterations.iter().position(|&taken| taken > 0).unwrap_or(iterations.len());
     Quality {
@@ -132,8 +132,8 @@ pub fn quality_of(alignment: &Alignment) -> Quality {
     }
 }
 
-/// Whether one coarse alignment explains the frame better than another, both as of
-/// [`Aligner::explanation`]: more inliers, counted over all points so that looking away does not pay.
+/// Whether one coarse alignment explains the frame better than another, both from [`Aligner::explanation`]: more
+/// inliers, counted over all points so that looking away does not pay.
 ///
 /// [`Aligner::explanation`]: crate::slam::alignment::align::Aligner::explanation
 pub fn is_better(one: &NormalEquations, other: &NormalEquations) -> bool {
@@ -141,10 +141,10 @@ pub fn is_better(one: &NormalEquations, other: &NormalEquations) -> bool {
         || (one.inliers == other.inliers && one.mean_energy() < other.mean_energy())
 }
 
-/// Whether of two states near each other one fits better: by the energy, which tells more finely than a count
-/// of inliers, unless one of them gains by looking away.
+/// Whether the first of two nearby states fits better: by the energy, which is finer than a count of inliers, unless
+/// one of them gains by looking away.
 pub fn fits_better(one: &NormalEquations, other: &NormalEquations) -> bool {
-    /// Shares of points compared that differ by more are not compared by the energy of those.
+    /// If the counts of points compared differ by more than this ratio, their energies are not compared.
     const SIMILAR_VIEW: f64 = 0.8;
     let counts = [one, other].map(|sums| f64::from(sums.compared));
     if counts[0].min(counts[1]) < SIMILAR_VIEW * counts[0].max(counts[1]) {

@@ -1,4 +1,4 @@
-//! Tests of starts whose brightness changes, by the exposure or by place.
+//! Tests of starts with a brightness that changes, with the exposure or over the image.
 
 use nalgebra::Vector6;
 
@@ -7,7 +7,7 @@ use super::*;
 use crate::slam::test_scene::{CAMERA, Scene};
 
 #[test]
-fn a_change_of_brightness_is_no_parallax_and_is_found() {
+fn a_change_of_brightness_is_not_parallax_and_is_estimated() {
     let (first, second, _) = two_views(2.0);
     let brighter = |pixels: &[u8]| -> Vec<u8> {
         pixels.iter().map(|&p| (1.2 * (f32::from(p) - 128.0) + 138.0) as u8).collect()
@@ -36,7 +36,7 @@ fn with_vignette(pixels: &[u8]) -> Vec<u8> {
     pixels.iter().enumerate().map(|(i, &grey)| (f32::from(grey) * light(i)) as u8).collect()
 }
 
-/// The start after four frames of a camera that turns by 9 px a frame and moves by so many metres.
+/// The start after four frames of a camera that rotates by 9 px and moves by so many metres per frame.
 fn turning(metres: f64, has_vignette: bool) -> (TwoFrameInitializer, InitOutcome) {
     let scene = Scene::new(5);
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
@@ -51,7 +51,7 @@ fn turning(metres: f64, has_vignette: bool) -> (TwoFrameInitializer, InitOutcome
 }
 
 #[test]
-fn a_vignette_is_no_parallax_and_leaves_the_start_as_it_is() {
+fn a_vignette_is_not_parallax_and_leaves_the_start_unchanged() {
     let [(_, standing), (_, bare)] = [true, false].map(|vignette| turning(0.0, vignette));
     assert_eq!(standing.state, InitState::Waiting(Waiting::Significance), "{standing:?}");
     assert!(standing.evidence.median_residual < 1.1 * bare.evidence.median_residual);
@@ -64,7 +64,7 @@ fn a_vignette_is_no_parallax_and_leaves_the_start_as_it_is() {
 }
 
 #[test]
-fn the_gain_differs_from_place_to_place_only_where_it_must() {
+fn the_gain_varies_over_the_image_only_where_it_must() {
     for metres in [0.0, 0.03] {
         let [behind_a_lens, even] = [true, false].map(|vignette| {
             let (mut initializer, _) = turning(metres, vignette);
@@ -73,18 +73,18 @@ fn the_gain_differs_from_place_to_place_only_where_it_must() {
         assert!(behind_a_lens.iter().all(Option::is_some), "{metres}: {behind_a_lens:?}");
         assert!(even.iter().all(Option::is_none), "{metres}: {even:?}");
     }
-    // Where it is let in, with what the frames before have left.
+    // Freed here, after what the previous frames have left.
     let (mut initializer, _) = turning(0.03, false);
     initializer.free_slopes();
     assert!(initializer.joint.best().0.gain_slopes.is_some());
-    // A start afterwards is one of its own.
+    // A later start is independent of it.
     let (mut initializer, _) = turning(0.0, true);
     assert!(initializer.begin(&two_views(2.0).0));
     assert!(initializer.rotation.gain_slopes.is_none());
 }
 
 #[test]
-fn to_ask_what_slopes_promise_changes_nothing() {
+fn querying_the_effect_of_slopes_changes_nothing() {
     let (mut initializer, _) = turning(0.03, false);
     initializer.fit_jointly();
     let fitted = initializer.joint.best().1.system.clone();
@@ -95,7 +95,7 @@ fn to_ask_what_slopes_promise_changes_nothing() {
 }
 
 #[test]
-fn frames_before_slopes_were_let_in_are_scored_with_them() {
+fn frames_before_slopes_were_freed_are_scored_with_them() {
     let scene = Scene::new(5);
     let seen = |frame: f64| {
         let pose = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.02 * frame, 0.03 * frame, 0.0));
@@ -122,7 +122,7 @@ fn frames_before_slopes_were_let_in_are_scored_with_them() {
 }
 
 #[test]
-fn an_even_image_does_not_match() {
+fn a_uniform_image_does_not_match() {
     let (first, _, _) = two_views(2.0);
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
     for grey in [0u8, 90, 200] {

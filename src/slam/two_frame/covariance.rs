@@ -1,4 +1,4 @@
-//! How uncertain a start is: the pose with the length of its translation held, and the depths.
+//! Uncertainty of a start: the pose with the length of its translation held, and the depths.
 
 use nalgebra::SVector;
 
@@ -8,9 +8,9 @@ use crate::slam::two_frame::state::State;
 use crate::slam::two_frame::system::{PointSystem, System};
 use crate::slam::upper_median::upper_median;
 
-/// Variance of each point's inverse depth with the length of the translation held: its own residuals',
-/// and what the uncertainty of the pose adds, by [`pose_covariance`]. `noise` is the variance of a residual, `match_variance_px`
-/// that of what interpolation and sampling misplace, pixels²; infinite where a point is not visible.
+/// Variance of each point's inverse depth with the length of the translation held: that of its own residuals, plus the
+/// effect of the uncertain pose, by [`pose_covariance`]. `noise` is the variance of a residual, `match_variance_px`
+/// that of the misplacement by interpolation and sampling, pixels²; infinite where a point is not visible.
 pub fn depth_variances(
     pose_covariance: Option<&PoseMatrix>,
     system: &System,
@@ -29,14 +29,14 @@ pub fn depth_variances(
     }));
 }
 
-/// What the uncertainty of the pose adds to the variance of a point's inverse depth, for residuals of variance 1.
+/// Effect of the uncertain pose on the variance of a point's inverse depth, for residuals of variance 1.
 fn from_pose(point: &PointSystem, pose_covariance: &PoseMatrix) -> f32 {
     let mixed = SVector::from(point.mixed.map(f64::from)) / f64::from(point.information);
     (mixed.transpose() * pose_covariance * mixed)[0] as f32
 }
 
-/// Median over the visible points of the relative error that the uncertainty of the pose gives all depths
-/// together, infinite where it cannot be told; `noise` is the variance of a residual.
+/// Median over the visible points of the relative error that the uncertain pose causes in all depths together, infinite
+/// where it is undetermined; `noise` is the variance of a residual.
 pub fn common_error(
     pose_covariance: Option<&PoseMatrix>,
     state: &State,
@@ -52,8 +52,8 @@ pub fn common_error(
     upper_median(&mut errors, f32::total_cmp).map_or(f64::INFINITY, f64::from)
 }
 
-/// Inverse of the pose's normal equations after elimination of the depths, scale held; `None` where
-/// they are not positive definite.
+/// Inverse of the pose's normal equations after elimination of the depths, with the scale held; `None` where they are
+/// not positive definite.
 pub fn pose_covariance(state: &State, system: &System) -> Option<PoseMatrix> {
     let mut hessian = system.hessian;
     for point in system.points().filter(|p| p.visible && p.information > 0.0) {
@@ -62,7 +62,7 @@ pub fn pose_covariance(state: &State, system: &System) -> Option<PoseMatrix> {
     }
     let length = state.current_from_first.translation.norm();
     if length > 0.0 {
-        // A weight far above any other holds the translation's length.
+        // A weight far above any other holds the length of the translation.
         let weight = 1e3 * system.hessian.diagonal().rows(0, 3).sum();
         let direction = state.current_from_first.translation / length;
         let mut along = SVector::<f64, NUM_UNKNOWNS>::zeros();

@@ -1,9 +1,8 @@
 //! Earlier frames of a start, which the depths of every motion must explain as well.
 //!
-//! Two views of a plane are explained by two motions, with the translation and the normal of the plane
-//! exchanged (Longuet-Higgins 1986), and two near views of a shallow scene nearly so. The plane of the
-//! wrong motion turns with the camera's path, the true one stays: the depths found in one frame fit the
-//! others only where they are right.
+//! Two views of a plane are explained by two motions, with the translation and the normal of the plane exchanged
+//! (Longuet-Higgins 1986), and two near views of a shallow scene nearly so. The plane of the wrong motion rotates along
+//! the camera's path, the true one does not: depths found in one frame fit the others only where they are right.
 
 use std::collections::VecDeque;
 
@@ -14,7 +13,7 @@ use crate::slam::two_frame::fit::{FitInput, FitParams, FitScratch, Freedom, fit_
 use crate::slam::two_frame::state::State;
 use crate::slam::two_frame::system::{System, compare};
 
-/// Levels on which an earlier frame is used to score, coarse to fine: motions differ by pixels, and half of the
+/// Levels on which an earlier frame scores a motion, coarse to fine: motions differ by pixels, and half of the
 /// resolution is a quarter of the time and memory.
 const LEVELS: std::ops::RangeInclusive<usize> = 1..=2;
 
@@ -23,7 +22,7 @@ const LEVELS: std::ops::RangeInclusive<usize> = 1..=2;
 struct EarlierFrame {
     /// Its images, finest kept level first.
     images: Vec<Image<f32>>,
-    /// Its fit without translation: where the search for its pose begins.
+    /// Its fit without translation: the initial value for its pose.
     rotation: State,
 }
 
@@ -34,17 +33,17 @@ pub struct EarlierFrames {
 }
 
 impl EarlierFrames {
-    /// Forgets all.
+    /// Forgets all frames.
     pub fn clear(&mut self) {
         self.kept.clear();
     }
 
-    /// How many there are.
+    /// Number of frames.
     pub fn len(&self) -> usize {
         self.kept.len()
     }
 
-    /// Adds a frame (all its levels, and its fit without translation); at most `most` are kept.
+    /// Adds a frame (all its levels, and its fit without translation), keeping at most `most`.
     pub fn push(&mut self, images: &[Image<f32>], rotation: &State, most: usize) {
         while self.kept.len() >= most.max(1) {
             self.kept.pop_front();
@@ -54,13 +53,13 @@ impl EarlierFrames {
         self.kept.push_back(EarlierFrame { images, rotation: rotation.clone() });
     }
 
-    /// Lets the gain of all of them differ from place to place.
+    /// Lets the gain of all of them vary over the image.
     pub fn free_slopes(&mut self) {
         self.kept.iter_mut().for_each(|frame| frame.rotation.free_slopes());
     }
 
-    /// Energies of the earlier frames with the depths of two motions, each frame from the pose that fits it best, of the
-    /// points that both see. `input` gives points and intrinsics. The sums go in the order of the frames.
+    /// Energies of the earlier frames with the depths of two motions, each frame at the pose that fits it best, over
+    /// the points that both see. `input` gives points and intrinsics. The sums are in the order of the frames.
     pub fn compare(
         &self,
         input: &FitInput<'_>,
@@ -91,7 +90,7 @@ impl EarlierFrames {
     }
 }
 
-/// Finest and coarsest level of so many that score.
+/// Finest and coarsest of `levels` that score.
 fn scoring_levels(levels: usize) -> (usize, usize) {
     let last = levels.saturating_sub(1);
     ((*LEVELS.start()).min(last), (*LEVELS.end()).min(last))

@@ -1,14 +1,14 @@
-//! The depths eliminated from the normal equations, and what holds them without parallax.
+//! Elimination of the depths from the normal equations, and the priors that hold them without parallax.
 //!
-//! Each depth meets only the pose (Schur complement): with D_i the damped information of depth i and
-//! m_i its row of mixed terms,
+//! Each depth is coupled only to the pose (Schur complement): with D_i the damped information of depth i and m_i its
+//! row of mixed terms,
 //!
 //! ```text
 //! (H − Σ m_i m_iᵀ/D_i) δ = −(g − Σ m_i g_i/D_i)        δd_i = −(g_i + m_iᵀδ)/D_i
 //! ```
 //!
-//! Two priors make D_i positive: a depth lies near the median of its neighbours and, loosely, near 1;
-//! the second also holds the scale, which the images leave free.
+//! Two priors make D_i positive: a depth lies near the median of its neighbours and, loosely, near 1; the second also
+//! fixes the scale, which the images leave free.
 
 use nalgebra::SVector;
 
@@ -18,16 +18,16 @@ use crate::slam::two_frame::lanes::{
 use crate::slam::two_frame::points::{NUM_NEIGHBOURS, NeighbourBlock};
 use crate::slam::two_frame::system::System;
 
-/// Smallest and largest inverse depth, the mean being 1. Negative ones have no meaning; that a point
-/// reaches them tells a wrong minimum.
+/// Smallest and largest inverse depth, the mean being 1. Negative ones are meaningless; a point that reaches them
+/// indicates a wrong minimum.
 const INVERSE_DEPTHS: (f32, f32) = (-2.0, 10.0);
 
 /// Weights of the two priors, in the squared grey levels of the energy.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct PriorWeights {
-    /// Of the distance from the neighbours' median.
+    /// Weight of the distance from the neighbours' median.
     pub neighbour: f32,
-    /// Of the distance from 1.
+    /// Weight of the distance from 1.
     pub depth: f32,
 }
 
@@ -77,7 +77,7 @@ impl Elimination {
         }
     }
 
-    /// The depths after the pose's step; their part −Σ g_i δd_i of what the step promises.
+    /// Writes the depths after the pose's step; returns their part −Σ g_i δd_i of the predicted decrease.
     pub fn depths_after(
         &self,
         system: &System,
@@ -85,7 +85,7 @@ impl Elimination {
         step: &SVector<f64, NUM_UNKNOWNS>,
         after: &mut Vec<f32>,
     ) -> f64 {
-        /// Largest change of a depth in one step: the projection is far from linear beyond.
+        /// Largest change of a depth in one step: beyond it the projection is far from linear.
         const MAX_DEPTH_STEP: f32 = 0.5;
         let step: [f32; NUM_UNKNOWNS] = std::array::from_fn(|k| step[k] as f32);
         after.clear();
@@ -128,7 +128,7 @@ pub fn prior_energy(inverse_depths: &[f32], medians: &[f32], weights: PriorWeigh
     sum.total()
 }
 
-/// The comparisons that put eight numbers in order (a network of 19, the least).
+/// The comparisons that sort eight numbers (a network of 19, the minimum).
 const SORTING_NETWORK: [(usize, usize); 19] = [
     (0, 2),
     (1, 3),

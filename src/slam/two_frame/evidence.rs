@@ -1,8 +1,8 @@
-//! Whether two frames show parallax, or noise and rotation alone.
+//! Decides whether two frames show parallax, or only noise and rotation.
 //!
-//! A rotation leaves no trace of depth: then each depth that is fitted explains no more than one
-//! degree of freedom's share of the noise. Parallax explains many times more, and leaves no point
-//! behind the camera. What another motion explains about as well is not proven either.
+//! A rotation contains no information about depth: each fitted depth then explains no more than one degree of freedom's
+//! share of the noise. Parallax explains many times more, and leaves no point behind the camera. Nor is a motion proven
+//! that another explains about as well.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,51 +13,49 @@ use crate::slam::two_frame::state::State;
 use crate::slam::two_frame::system::System;
 use crate::slam::upper_median::upper_median;
 
-/// What counts as proof.
+/// Thresholds of the proof.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct EvidenceParams {
     /// Shortest translation, in mean depths: 1/60 moves a point at the mean depth by 9 px of a 640 px
     /// image (Engel, Koltun, Cremers 2018 latch there).
     pub min_translation: f64,
-    /// Longest translation, in mean depths. Beyond it what is seen changes its size so much that nothing is matched: a fit
-    /// that goes there has drawn all points together on a few pixels.
+    /// Longest translation, in mean depths. Beyond it the scene changes its size so much that nothing matches: a fit
+    /// that gets there has drawn all points together on a few pixels.
     pub max_translation: f64,
-    /// Shortest translation with which a start can be proven early, in mean depths: 2 px at 640. The
-    /// earlier frames must confirm it; its depths are good to a tenth, and later frames correct them.
+    /// Shortest translation with which a start can be proven early, in mean depths: 2 px at 640. The earlier frames
+    /// must confirm it; its depths are accurate to a tenth, and later frames correct them.
     pub min_early_translation: f64,
-    /// Earlier frames that an early start needs.
+    /// Number of earlier frames that an early start needs.
     pub min_earlier_frames: usize,
-    /// Energy by which another motion must be worse, in this frame and the earlier ones together, as a
-    /// share: what a rolling shutter and the lens leave is of that size.
+    /// Least excess of another motion's energy, in this frame and the earlier ones together, as a share: residuals of a
+    /// rolling shutter and the lens are of that size.
     pub min_rival_excess: f64,
-    /// The same for a motion that does not turn clearly less than its rival. On a plane the wrong motion
-    /// adds a turn to the true one, and the rolling shutter of a nodding camera favours it by up to
-    /// 0.18.
+    /// The same for a motion that does not rotate clearly less than its rival. On a plane the wrong motion adds a
+    /// rotation to the true one, and the rolling shutter of a nodding camera favours it by up to 0.18.
     pub min_turning_rival_excess: f64,
-    /// Rotation over the rival's from which that holds.
+    /// Largest ratio of its rotation to the rival's at which a motion rotates clearly less.
     pub max_turn_ratio: f64,
-    /// Rotation between two motions, radians, over the translation in mean depths, below which neither turns more. Along
-    /// a plane the two differ by 1.
+    /// Rotation between two motions, radians, over the translation in mean depths, below which neither rotates more.
+    /// Along a plane the two differ by 1.
     pub min_turn_apart: f64,
-    /// Largest median of the relative error that the uncertainty of the pose gives all depths together:
-    /// later frames cannot see it, and take it for the shape of the scene.
+    /// Largest median of the relative error that the uncertain pose causes in all depths together: later frames cannot
+    /// see it, and take it for the shape of the scene.
     pub max_common_error: f64,
-    /// Energy that a fitted depth explains over the energy of one degree of freedom of what remains.
-    /// Without parallax 1 to 3, with 9 px of it 30 to 100.
+    /// Energy that a fitted depth explains over the energy of one remaining degree of freedom. Without parallax 1 to 3,
+    /// with 9 px of it 30 to 100.
     pub min_significance: f64,
-    /// Most points behind the camera, as a share of the well-placed ones in the half that fits best. More mean a wrong
-    /// minimum.
+    /// Largest share of points behind the camera, of the well-placed ones in the half that fits best. More indicate a
+    /// wrong minimum.
     pub max_negative_ratio: f64,
     /// Largest median of the relative standard deviation of the inverse depths.
     pub max_std_dev_ratio: f64,
     /// Least share of the points in view.
     pub min_visible_ratio: f64,
-    /// Largest root mean square residual of the middle point, grey levels: above it the frames do not
-    /// show the same.
+    /// Largest root mean square residual of the median point, grey levels: above it the frames do not show the same.
     pub max_median_residual: f64,
-    /// The same as a multiple of the least that a frame of this start has left, which is the camera's noise:
-    /// a fit that leaves more has ended in a wrong minimum.
+    /// The same as a multiple of the least residual of a frame of this start, which is the camera's noise: a fit that
+    /// leaves more has ended in a wrong minimum.
     pub max_residual_growth: f64,
 }
 
@@ -104,16 +102,16 @@ impl EvidenceParams {
     }
 }
 
-/// What is not proven yet.
+/// The part of the proof that is missing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Waiting {
     /// The frame has too little texture for enough points.
     Texture,
-    /// Too few points are in view, or they do not look alike.
+    /// Too few points are in view, or they do not match.
     Match,
     /// A rotation explains the frame about as well.
     Significance,
-    /// Too many points come out behind the camera.
+    /// Too many points are behind the camera.
     NegativeDepth,
     /// Another motion explains the frames about as well.
     Rival,
@@ -121,7 +119,7 @@ pub enum Waiting {
     Translation,
     /// The depths are too uncertain.
     Accuracy,
-    /// All is proven, but not by enough frames in a row.
+    /// All is proven, but not by enough consecutive frames.
     Confirmation,
 }
 
@@ -132,15 +130,15 @@ pub struct Evidence {
     pub translation: f64,
     /// Energy that a fitted depth explains over that of a remaining degree of freedom.
     pub significance: f64,
-    /// Share of the well-placed points that come out behind the camera, of the half that fits best.
+    /// Share of the well-placed points that are behind the camera, of the half that fits best.
     pub negative_ratio: f64,
     /// Median relative standard deviation of the inverse depths.
     pub median_std_dev_ratio: f64,
-    /// Median relative error of the inverse depths that the uncertainty of the pose gives all together.
+    /// Median relative error that the uncertain pose causes in all inverse depths together.
     pub common_error: f64,
     /// Share of the points in view.
     pub visible_ratio: f64,
-    /// Root mean square residual (Huber) of the middle point, grey levels.
+    /// Root mean square residual (Huber) of the median point, grey levels.
     pub median_residual: f64,
     /// The least of these among the frames of this start, at least the camera's noise.
     pub least_residual: f64,
@@ -148,15 +146,15 @@ pub struct Evidence {
     pub log_gain: f64,
     /// The second best motion; `None` where there is no other.
     pub rival: Option<Rival>,
-    /// Earlier frames that were asked which motion they show.
+    /// Number of earlier frames that scored the motions.
     pub earlier_frames: usize,
 }
 
 impl Evidence {
-    /// What is missing; `None` when the parallax is proven.
+    /// The first part of the proof that is missing; `None` when the parallax is proven.
     pub fn missing(&self, params: &EvidenceParams) -> Option<Waiting> {
-        /// A factor of four: no exposure changes by more within a start, and a small gain explains any image by an even
-        /// one.
+        /// A factor of four: no exposure changes by more within a start, and with a small gain a uniform image explains
+        /// any other.
         const MAX_LOG_GAIN: f64 = 1.4;
         let matches = self.visible_ratio >= params.min_visible_ratio
             && self.translation <= params.max_translation
@@ -183,7 +181,7 @@ impl Evidence {
         checks.iter().find(|(met, _)| !met).map(|(_, waiting)| *waiting)
     }
 
-    /// Whether the translation is long enough, or confirmed well enough.
+    /// Whether the translation is long enough, or short but confirmed.
     fn has_moved(&self, params: &EvidenceParams) -> bool {
         let is_confirmed = self.earlier_frames >= params.min_earlier_frames;
         self.translation >= params.min_translation
@@ -191,11 +189,11 @@ impl Evidence {
     }
 }
 
-/// Degrees of freedom of a point, its samples less its depth, over its samples.
+/// Degrees of freedom of a point (its samples minus its depth) over its samples.
 const FREEDOM_RATIO: f32 = (PATTERN.len() as f32 - 1.0) / PATTERN.len() as f32;
 
-/// Variance of a residual, grey levels²: the median over the points of the energy a degree of freedom,
-/// which occlusions do not raise.
+/// Variance of a residual, grey levels²: the median over the points of the energy per degree of freedom, which
+/// occlusions do not raise.
 pub fn residual_variance(system: &System, sorted: &mut Vec<f32>) -> f32 {
     sorted.clear();
     sorted.extend(
@@ -204,8 +202,8 @@ pub fn residual_variance(system: &System, sorted: &mut Vec<f32>) -> f32 {
     upper_median(sorted, f32::total_cmp).unwrap_or(f32::INFINITY)
 }
 
-/// Judges the joint fit (`state`, `joint` and its variances) against the pure `rotation`; what other
-/// motions and earlier frames say is not in it yet.
+/// Judges the joint fit (`state`, `joint` and its variances) against the pure `rotation`; rival motions and earlier
+/// frames are not included yet.
 pub fn judge(
     state: &State,
     joint: &System,
@@ -213,14 +211,14 @@ pub fn judge(
     rotation: &System,
     sorted: &mut Vec<f32>,
 ) -> Evidence {
-    /// A point whose depth is known to better than this share of the mean has a sign.
+    /// A point whose depth is more accurate than this share of the mean has a definite sign.
     const PLACED_STD_DEV: f32 = 0.3;
-    /// Standard deviations by which a point must lie behind the camera: of points at infinity every second one is
-    /// found there, a little.
+    /// Standard deviations by which a point must lie behind the camera: of points at infinity every second one comes
+    /// out slightly behind it.
     const BEHIND_STD_DEVS: f32 = 2.0;
     let (mut explained, mut remaining, mut both, mut depths) = (0.0f64, 0.0f64, 0usize, 0.0f64);
     let (mut placed, mut negative) = (0usize, 0usize);
-    // A near point that moves far ends in a wrong minimum now and then, also behind the camera, but does not fit there.
+    // A near point that moves far sometimes ends in a wrong minimum, also behind the camera, but does not fit there.
     let variance = residual_variance(joint, sorted);
     for (i, (point, alone)) in joint.points().zip(rotation.points()).enumerate() {
         if !point.visible {
@@ -248,7 +246,7 @@ pub fn judge(
     Evidence {
         translation: state.current_from_first.translation.norm() * mean,
         significance: if both > 0 { explained * freedoms / remaining.max(1.0) } else { 0.0 },
-        // Nothing well placed proves nothing: half of the points fit.
+        // Without well-placed points nothing is proven: half of the points fit.
         negative_ratio: if placed * 4 > joint.num_visible {
             negative as f64 / placed as f64
         } else {
@@ -271,7 +269,7 @@ pub fn judge(
 mod tests {
     use super::*;
 
-    /// All that a start asks for.
+    /// Everything that a start requires.
     fn proven() -> Evidence {
         Evidence {
             translation: 0.03,
@@ -289,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn two_motions_that_explain_the_frames_alike_prove_nothing() {
+    fn two_motions_that_explain_the_frames_equally_prove_nothing() {
         let params = EvidenceParams::default();
         assert_eq!(proven().missing(&params), None);
         let against = |excess| {
@@ -302,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn a_motion_that_turns_more_than_its_rival_needs_more_evidence() {
+    fn a_motion_that_rotates_more_than_its_rival_needs_more_evidence() {
         let params = EvidenceParams::default();
         let against = |excess, turn_ratio, turn_apart| {
             let rival = Some(Rival { excess, turn_ratio, turn_apart });
@@ -317,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_common_to_all_depths_and_a_bad_fit_are_waited_for() {
+    fn a_start_waits_on_an_error_common_to_all_depths_and_on_a_bad_fit() {
         let params = EvidenceParams::default();
         let uncertain = Evidence { common_error: 0.05, ..proven() };
         assert_eq!(uncertain.missing(&params), Some(Waiting::Accuracy));

@@ -1,4 +1,4 @@
-//! Tests of the start of a camera that moves by a whole baseline from one frame to the next.
+//! Tests of starts of a camera that moves by a whole baseline from one frame to the next.
 
 use nalgebra::Vector6;
 
@@ -33,13 +33,13 @@ fn a_fast_camera_starts_on_its_third_frame() {
 }
 
 #[test]
-fn where_the_first_frame_is_out_of_view_the_frame_before_takes_its_place() {
+fn the_previous_frame_replaces_a_first_frame_that_is_out_of_view() {
     let frames = along_the_axis(1, 0.2, 3);
     let mut initializer = initializer();
     initializer.step(&frames[0]);
     let proves = initializer.step(&frames[1]);
     assert_eq!((proves.state, proves.frames), (InitState::Waiting(Waiting::Confirmation), 1));
-    // What the third frame shows of the first is too little now.
+    // The third frame now shows too little of the first.
     initializer.params.evidence.min_visible_ratio = 0.8;
     let goes_on = initializer.step(&frames[2]);
     assert_eq!((goes_on.state, goes_on.frames), (InitState::Proven, 1), "{goes_on:?}");
@@ -48,7 +48,7 @@ fn where_the_first_frame_is_out_of_view_the_frame_before_takes_its_place() {
 }
 
 #[test]
-fn a_frame_before_without_enough_points_is_no_first_frame() {
+fn a_previous_frame_with_too_few_points_is_not_a_first_frame() {
     let frames = along_the_axis(1, 0.2, 3);
     let mut initializer = initializer();
     initializer.step(&frames[0]);
@@ -60,7 +60,7 @@ fn a_frame_before_without_enough_points_is_no_first_frame() {
 }
 
 #[test]
-fn a_camera_that_is_back_goes_on_from_its_first_frame() {
+fn a_camera_that_returns_continues_from_its_first_frame() {
     let frames = along_the_axis(1, 0.2, 2);
     let mut initializer = initializer();
     for frame in [&frames[0], &frames[1]] {
@@ -94,7 +94,7 @@ fn directions_are_tried_in_the_first_frame() {
 }
 
 #[test]
-fn motions_are_compared_where_both_see_the_points() {
+fn motions_are_compared_over_points_that_both_see() {
     let frames = along_the_axis(1, 0.2, 2);
     let mut initializer = initializer();
     initializer.step(&frames[0]);
@@ -120,7 +120,7 @@ fn motions_are_compared_where_both_see_the_points() {
 }
 
 #[test]
-fn a_point_that_is_behind_the_camera_by_its_noise_is_not_behind_it() {
+fn a_point_behind_the_camera_within_its_noise_does_not_count() {
     let frames = along_the_axis(1, 0.2, 2);
     let mut initializer = initializer();
     for frame in &frames {
@@ -161,7 +161,7 @@ fn a_point_in_a_wrong_minimum_behind_the_camera_does_not_count() {
 }
 
 #[test]
-fn a_camera_on_its_side_has_as_many_levels() {
+fn a_portrait_image_has_as_many_levels_as_a_landscape_one() {
     let levels = |width, height| num_levels(&Intrinsics::pinhole(width, height, 500.0));
     for (long, short) in [(640, 480), (1226, 370), (320, 240), (1920, 1080)] {
         assert_eq!(levels(long, short), levels(short, long), "{long}×{short}");

@@ -1,5 +1,5 @@
-//! Levenberg–Marquardt on pose, brightness and inverse depths together, coarse to fine; and on rotation
-//! and brightness alone.
+//! Levenberg–Marquardt on pose, brightness and inverse depths jointly, coarse to fine; and on rotation and brightness
+//! alone.
 
 use nalgebra::{SMatrix, SVector, Vector6};
 use serde::{Deserialize, Serialize};
@@ -21,16 +21,16 @@ use crate::slam::two_frame::system_kernel::{Medians, Reduction};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FitParams {
-    /// The camera's noise, which weighs images against priors and which the configuration has once for all.
+    /// The camera's noise, which weights images against priors and is configured once for all.
     #[serde(skip)]
     pub noise: ImageNoise,
     /// Standard deviation of an inverse depth about its neighbours' median; the mean is 1.
     pub neighbour_std_dev: f32,
     /// Standard deviation of an inverse depth about 1: loose, rooms vary by more than a factor of 2.
     pub depth_std_dev: f32,
-    /// Most iterations a level.
+    /// Maximum number of iterations per level.
     pub max_iterations: u32,
-    /// A level is done when a step lowers the energy by less than this share, or promises no more.
+    /// A level has converged when a step lowers the energy by less than this share, or is predicted to.
     pub min_energy_drop: f64,
 }
 
@@ -55,12 +55,12 @@ impl FitParams {
         check_range("min_energy_drop", self.min_energy_drop, 0.0..=0.5)
     }
 
-    /// The same with priors that hold the unit and points without any information, and nothing else.
+    /// A copy with priors that constrain only the unit and points without any information.
     pub fn released(&self) -> Self {
         /// Factor on the standard deviations of the priors: a hundredth of their weight. Thirty changes no
         /// figure any more.
         const RELEASE: f32 = 10.0;
-        /// Soft modes take more and smaller steps.
+        /// Weakly constrained modes take more and smaller steps.
         const MAX_ITERATIONS: u32 = 40;
         const MIN_ENERGY_DROP: f64 = 1e-6;
         Self {
@@ -96,7 +96,7 @@ pub struct FitInput<'a> {
 }
 
 impl<'a> FitInput<'a> {
-    /// One level, from the finest on.
+    /// One level, from the finest one on.
     pub fn level(&self, level: usize) -> LevelView<'a> {
         LevelView {
             image: &self.images[level - self.finest],
@@ -106,12 +106,12 @@ impl<'a> FitInput<'a> {
     }
 }
 
-/// What may move.
+/// The free unknowns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Freedom {
     /// Rotation and brightness.
     Rotation,
-    /// Pose and brightness; the depths stay.
+    /// Pose and brightness; the depths are fixed.
     Pose,
     /// Pose, brightness and depths.
     Everything,
@@ -128,7 +128,7 @@ pub struct FitScratch {
     trial_depths: Vec<f32>,
 }
 
-/// Fits `state` on one level; the energy with priors that it ends at.
+/// Fits `state` on one level and returns its final energy, including the priors.
 pub fn fit_level(
     input: &FitInput<'_>,
     level: usize,
@@ -145,7 +145,7 @@ pub fn fit_level(
     let mut before = energy(&scratch.system, state, &scratch.medians, weights);
     for _ in 0..params.max_iterations {
         let Some(step) = step_of(freedom, scratch, state, damping.factor, weights) else {
-            // The model is good for less than the step that it asks for.
+            // The model does not hold as far as the step that it suggests.
             if damping.fail() {
                 break;
             }
@@ -184,7 +184,7 @@ pub fn fit_level(
 /// A matrix over the unknowns of pose and brightness: normal equations, or the covariance for residuals of variance 1.
 pub type PoseMatrix = SMatrix<f64, NUM_UNKNOWNS, NUM_UNKNOWNS>;
 
-/// Damping of the steps, and how many more in a row may fail.
+/// Damping of the steps, and how many further consecutive ones may fail.
 struct Damping {
     factor: f64,
     patience: u32,
@@ -194,8 +194,8 @@ impl Damping {
     /// A level that is far from its minimum may need smaller steps than the first.
     const FIRST: Self = Self { factor: 0.01, patience: 3 };
 
-    /// A step lowered the energy. When one does not any more, what is left is kinks between pixels: of six smaller
-    /// steps one lowered it, by less than half a per cent.
+    /// A step lowered the energy. Once one no longer does, only kinks between pixels are left: of six smaller steps one
+    /// lowered it, by less than half a per cent.
     fn succeed(&mut self) {
         const SUCCESS_FACTOR: f64 = 0.3;
         const LEAST_DAMPING: f64 = 1e-6;
@@ -203,7 +203,7 @@ impl Damping {
         self.patience = 1;
     }
 
-    /// There was no step, or it did not; whether it is over.
+    /// There was no step, or it did not lower the energy; returns whether to stop.
     fn fail(&mut self) -> bool {
         const FAILURE_FACTOR: f64 = 25.0;
         self.factor *= FAILURE_FACTOR;
@@ -212,10 +212,10 @@ impl Damping {
     }
 }
 
-/// A step of what may move; that of the depths is in the scratch.
+/// A step of the free unknowns; that of the depths is in the scratch.
 struct Step {
     of_pose: SVector<f64, NUM_UNKNOWNS>,
-    /// By how much the energy would fall if it were quadratic and the step not damped: −gᵀδ.
+    /// Predicted decrease of the energy if it were quadratic and the step undamped: −gᵀδ.
     promised_drop: f64,
 }
 
@@ -224,7 +224,7 @@ fn energy(system: &System, state: &State, medians: &[f32], weights: PriorWeights
     system.energy + prior_energy(&state.inverse_depths, medians, weights)
 }
 
-/// The step of what may move; where the depths may, those after it go to `trial_depths`. `None` where it cannot be taken.
+/// The step of the free unknowns; free depths after it are written to `trial_depths`. `None` where it cannot be taken.
 fn step_of(
     freedom: Freedom,
     scratch: &mut FitScratch,
@@ -247,8 +247,8 @@ fn step_of(
 
 /// The state after a step of pose and brightness, without depths.
 fn moved(state: &State, step: &SVector<f64, NUM_UNKNOWNS>) -> State {
-    /// What a lens that loses half of the light in the corners comes to where the image has moved by a tenth to a fifth
-    /// of its width, 1 a unit of the ray. Without a bound another scene is explained by slopes of 6.
+    /// Slope behind a lens that loses half of the light in the corners, where the image has moved by a tenth to a fifth
+    /// of its width, 1 per unit of the ray. Without the bound, slopes of 6 explain a different scene.
     const MAX_GAIN_SLOPE: f64 = 0.5;
     let twist = Vector6::from_iterator(step.iter().take(6).copied());
     let mut brightness = state.brightness;
@@ -270,7 +270,7 @@ fn find_medians(input: &FitInput<'_>, state: &State, medians: &mut Vec<f32>) {
     Kernel::fastest().run(Medians { neighbours, inverse_depths, medians });
 }
 
-/// −H⁻¹g over the unknowns of pose and brightness that may move; `None` where that is no step to be taken.
+/// −H⁻¹g over the free unknowns of pose and brightness; `None` where that is not a valid step.
 fn solve_free(
     freedom: Freedom,
     has_slopes: bool,
@@ -289,7 +289,7 @@ fn solve_free(
     step.filter(is_sane)
 }
 
-/// −H⁻¹g over `COUNT` unknowns from `FIRST` on; the others stay.
+/// −H⁻¹g over `COUNT` unknowns from `FIRST` on; 0 for the others.
 fn solve<const FIRST: usize, const COUNT: usize>(
     hessian: &PoseMatrix,
     gradient: &SVector<f64, NUM_UNKNOWNS>,
@@ -301,7 +301,7 @@ fn solve<const FIRST: usize, const COUNT: usize>(
     Some(step)
 }
 
-/// The step of pose and brightness; the depths after it go to `trial_depths`.
+/// The step of pose and brightness; the depths after it are written to `trial_depths`.
 fn joint_step(scratch: &mut FitScratch, state: &State, damping: f64) -> Option<Step> {
     let (system, elimination) = (&scratch.system, &mut scratch.elimination);
     elimination.damping_factor = 1.0 + damping as f32;
@@ -311,7 +311,7 @@ fn joint_step(scratch: &mut FitScratch, state: &State, damping: f64) -> Option<S
     for r in 0..NUM_UNKNOWNS {
         hessian[(r, r)] *= 1.0 + damping;
         gradient[r] -= elimination.sums.row(r);
-        // The lower triangle is all that the factorisation reads.
+        // The factorisation reads only the lower triangle.
         for c in 0..=r {
             hessian[(r, c)] -= elimination.sums.entry(r, c);
         }
@@ -322,7 +322,7 @@ fn joint_step(scratch: &mut FitScratch, state: &State, damping: f64) -> Option<S
     Some(Step { of_pose, promised_drop: by_depths - system.gradient.dot(&of_pose) })
 }
 
-/// Whether a step can be taken: finite and within what two frames in a row show.
+/// Whether a step can be taken: finite and within what two consecutive frames show.
 fn is_sane(step: &SVector<f64, NUM_UNKNOWNS>) -> bool {
     /// In mean depths, radians and log gain; the offset is bounded by the grey scale.
     const LARGEST: f64 = 1.0;
@@ -330,9 +330,9 @@ fn is_sane(step: &SVector<f64, NUM_UNKNOWNS>) -> bool {
     step.iter().enumerate().all(|(i, x)| x.is_finite() && (i == OFFSET || x.abs() < LARGEST))
 }
 
-/// By which share the energy of a fit that ended at `state` would fall if the gain might differ from place to place, to
-/// first order: what free slopes promise beyond what the other unknowns still do. The scratch is left as the fit left it
-/// on this level.
+/// Share by which the energy of a fit that ended at `state` would decrease if the gain could vary over the image, to
+/// first order: the predicted decrease with free slopes minus the one still predicted without. The scratch is left as
+/// the fit left it on this level.
 pub fn promised_by_slopes(
     input: &FitInput<'_>,
     level: usize,
@@ -361,9 +361,9 @@ mod tests {
     use crate::slam::two_frame::lanes::{LANES, lanes};
     use crate::slam::two_frame::system::SystemBlock;
 
-    /// Of a quadratic energy, with its priors, the step that is not damped brings what it promises.
+    /// For a quadratic energy, with its priors, the undamped step achieves the predicted decrease.
     #[test]
-    fn a_step_promises_what_it_brings() {
+    fn a_step_achieves_the_predicted_decrease() {
         let block = SystemBlock {
             mixed: std::array::from_fn(|k| lanes(|l| 0.1 * ((3 * k + l) as f32).sin())),
             information: lanes(|l| 3.0 + l as f32),

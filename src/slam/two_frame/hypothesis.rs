@@ -1,10 +1,10 @@
 //! Several starts of the joint fit, of which the best is kept.
 //!
-//! With little parallax the energy has several minima (near and far exchanged, a translation taken for
-//! a rotation), and a fit that began in the wrong one stays there while the baseline grows. So each
-//! frame is fitted from where the two best fits of the frame before ended, from there aligned with the
-//! depths that they found, from rest, from the mirrored solution and, in the first frame and once there is
-//! something to see, from a small step in each direction. Of the two best the earlier frames choose.
+//! With little parallax the energy has several minima (near and far exchanged, a translation taken for a rotation), and
+//! a fit that started in the wrong one stays there while the baseline grows. So each frame is fitted from the results
+//! of the previous frame's two best fits, from these aligned first with the depths they found, from rest, from the
+//! mirrored solution and, in the first frame and once parallax may show, from a small step in each direction. The
+//! earlier frames choose between the two best.
 
 use nalgebra::{Vector3, Vector6};
 use rayon::prelude::*;
@@ -22,10 +22,10 @@ const MAX_HYPOTHESES: usize = 2 * NUM_SURVIVORS + 2 + 6;
 /// Fits that continue to the finest level and to the next frame.
 const NUM_SURVIVORS: usize = 2;
 
-/// Cosine of 30°: nearer directions are the same motion, seen inaccurately.
+/// Cosine of 30°: closer directions are the same motion, estimated inaccurately.
 pub(super) const RIVAL_COSINE: f64 = 0.87;
 
-/// One start and where it came to.
+/// One start and its result.
 #[derive(Debug)]
 struct MotionHypothesis {
     state: State,
@@ -33,15 +33,15 @@ struct MotionHypothesis {
     scratch: FitScratch,
 }
 
-/// The second best motion of a frame, where it goes clearly another way than the best.
+/// The second best motion of a frame, if its direction clearly differs from the best.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rival {
-    /// Energy of this frame and the earlier ones beyond that of the best, as a share of it.
+    /// Excess of its energy, over this frame and the earlier ones, relative to the best.
     pub excess: f64,
-    /// Rotation that the best needs over the one that this needs.
+    /// Rotation of the best motion over that of this one.
     pub turn_ratio: f64,
-    /// Rotation between the two, radians, over the translation of the best in mean depths: of the two motions that a
-    /// plane allows the sine of the angle between the path and its normal.
+    /// Rotation between the two, radians, over the translation of the best in mean depths: for the two motions that a
+    /// plane allows, the sine of the angle between the path and its normal.
     pub turn_apart: f64,
 }
 
@@ -50,16 +50,16 @@ pub struct Rival {
 pub struct Hypotheses {
     all: Vec<MotionHypothesis>,
     used: usize,
-    /// How many of the first ones are results of the frame before.
+    /// How many of the first ones are results of the previous frame.
     survivors: usize,
-    /// The second best motion of the latest frame, if the two can be told apart by their direction.
+    /// The second best motion of the latest frame, if the two differ clearly in direction.
     pub rival: Option<Rival>,
-    /// How many earlier frames were asked about the latest one: none where there is but one motion.
+    /// Number of earlier frames that scored the latest one; 0 where there is only one motion.
     pub scored_by: usize,
 }
 
 impl Hypotheses {
-    /// Memory for all of them; every state the same.
+    /// Memory for all hypotheses, each with the same state.
     pub fn new(state: &State) -> Self {
         let empty = |_| MotionHypothesis {
             state: state.clone(),
@@ -70,14 +70,14 @@ impl Hypotheses {
         Self { all, used: 0, survivors: 0, rival: None, scored_by: 0 }
     }
 
-    /// Forgets what earlier frames have shown.
+    /// Forgets the results of earlier frames.
     pub fn restart(&mut self) {
         (self.used, self.survivors) = (0, 0);
         (self.rival, self.scored_by) = (None, 0);
     }
 
-    /// Fits all hypotheses to a frame. `rotation` is its fit without translation; `with_directions` adds
-    /// the starts, and scores the survivors by `earlier_frames`, which pays only where there may be parallax. The
+    /// Fits all hypotheses to a frame. `rotation` is its fit without translation; `with_directions` adds the starts in
+    /// each direction, and scores the survivors by `earlier_frames`, which pays only where there may be parallax. The
     /// result does not depend on the number of threads.
     pub fn fit(
         &mut self,
@@ -95,8 +95,8 @@ impl Hypotheses {
                     hypothesis.energy = fit_level(input, level, freedom, state, scratch, params);
                 }
             };
-        /// Level down to which every start is fitted: on 160 pixels across, one level coarser, a wrong
-        /// minimum of a recording looks better than the right one.
+        /// Level down to which every start is fitted: one level coarser, at 160 columns, a wrong minimum of a recording
+        /// looks better than the right one.
         const COARSE_LEVEL: usize = 1;
         let levels = input.images.len();
         let coarse = COARSE_LEVEL.min(levels - 1);
@@ -117,14 +117,14 @@ impl Hypotheses {
         }
     }
 
-    /// Puts that survivor first whose depths explain the images of this frame and the earlier ones best.
+    /// Puts the survivor first whose depths best explain the images of this frame and the earlier ones.
     fn score(&mut self, input: &FitInput<'_>, earlier_frames: &EarlierFrames, params: &FitParams) {
         self.scored_by = earlier_frames.len();
         let of_this_frame = compare(&self.all[0].scratch.system, &self.all[1].scratch.system);
         let depths = [0, 1].map(|i| self.all[i].state.inverse_depths.as_slice());
         let of_earlier_frames = earlier_frames.compare(input, depths, params);
         let [mut best, mut other] = [0, 1].map(|i| of_this_frame[i] + of_earlier_frames[i]);
-        /// A motion that sees fewer of the other's points than this share has lost them, however the rest fits.
+        /// A motion that sees less than this share of the other's points has lost them, however well the rest fits.
         const LEAST_SEEN: f64 = 1.0 / 3.0;
         let seen = [0, 1].map(|i| self.all[i].scratch.system.num_visible as f64);
         let [is_blind, other_is_blind] = [0, 1].map(|i| seen[i] < LEAST_SEEN * seen[1 - i]);
@@ -146,33 +146,33 @@ impl Hypotheses {
         }
     }
 
-    /// By which share of its energy the best fit would fall if the gain might differ from place to place.
+    /// Share by which the energy of the best fit would decrease if the gain could vary over the image.
     pub fn promised_by_slopes(&mut self, input: &FitInput<'_>, params: &FitParams) -> f64 {
         let best = &mut self.all[0];
         promised_by_slopes(input, 0, &best.state, &mut best.scratch, params)
     }
 
-    /// Lets the gain differ from place to place, from the next fit on.
+    /// Lets the gain vary over the image, from the next fit on.
     pub fn free_slopes(&mut self) {
         self.all[..self.survivors].iter_mut().for_each(|h| h.state.free_slopes());
     }
 
-    /// Fits the best again on one level, from where it is.
+    /// Fits the best hypothesis again on one level, from its current state.
     pub fn refit(&mut self, input: &FitInput<'_>, level: usize, params: &FitParams) {
         let best = &mut self.all[0];
         let (state, scratch) = (&mut best.state, &mut best.scratch);
         best.energy = fit_level(input, level, Freedom::Everything, state, scratch, params);
     }
 
-    /// The best fit with its normal equations at the finest level; before any fit the state given first.
+    /// The best fit with its normal equations at the finest level; before any fit the initial state.
     pub fn best(&mut self) -> (&mut State, &FitScratch) {
         let best = &mut self.all[0];
         (&mut best.state, &best.scratch)
     }
 
-    /// Sets the starts behind the survivors. First come the survivors once more, to be aligned with the depths that they
-    /// have before these are free: where the camera moved on by many pixels, depths end in wrong minima before the pose
-    /// is right.
+    /// Sets the starts after the survivors. The first of them are the survivors again, to be aligned with their depths
+    /// before these are free: where the camera moved by many pixels, depths end in wrong minima before the pose is
+    /// right.
     fn propose(&mut self, rotation: &State, with_directions: bool) {
         self.used = self.survivors;
         for survivor in 0..self.survivors {
@@ -183,7 +183,7 @@ impl Hypotheses {
         if self.survivors > 0 {
             let best = self.all[0].state.clone();
             let pose = mirrored(&best.current_from_first, &rotation.current_from_first);
-            // Near and far exchanged about the mean; a point nearer than twice that goes far away.
+            // Near and far exchanged about the mean; a point nearer than twice that becomes distant.
             self.add(&best, pose, |d| (2.0 - d).clamp(0.1, 2.0));
         }
         if with_directions {
@@ -204,8 +204,8 @@ impl Hypotheses {
     }
 }
 
-/// Moves the best hypothesis that went another way than the best of all to the second place; how many
-/// survive.
+/// Moves the best hypothesis whose direction differs from that of the best one to the second position; returns the
+/// number of survivors.
 fn bring_forward_distinct(sorted: &mut [MotionHypothesis]) -> usize {
     /// Cosine of 15° between directions that count as the same.
     const SAME_COSINE: f64 = 0.966;
@@ -227,8 +227,8 @@ fn heading(pose: &SE3) -> Vector3<f64> {
     pose.translation / pose.translation.norm().max(f64::MIN_POSITIVE)
 }
 
-/// The mirrored pose: the translation reversed, the rotation on the other side of the one that explains
-/// the frame best without translation.
+/// The mirrored pose: the translation reversed, the rotation on the other side of the one that best explains the frame
+/// without translation.
 fn mirrored(current_from_first: &SE3, rotation_alone: &SE3) -> SE3 {
     let best = rotation_alone.rotation;
     SE3 {
@@ -237,9 +237,9 @@ fn mirrored(current_from_first: &SE3, rotation_alone: &SE3) -> SE3 {
     }
 }
 
-/// A step along one of ±x, ±y, ±z with the turn that keeps the centre of the image where it is.
+/// A step along one of ±x, ±y, ±z with the rotation that keeps the centre of the image in place.
 fn stepped(rotation_alone: &SE3, axis: usize) -> SE3 {
-    /// In mean depths: about where a start is proven.
+    /// In mean depths: about the size at which a start is proven.
     const STEP: f64 = 0.02;
     let mut step = Vector3::zeros();
     step[axis % 3] = if axis < 3 { STEP } else { -STEP };

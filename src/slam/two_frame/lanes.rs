@@ -1,9 +1,9 @@
-//! Eight points side by side: what the start computes for all points goes through blocks of them.
+//! Eight points side by side: the start processes all points in blocks of them.
 
-/// Points of a block.
+/// Points per block.
 pub const LANES: usize = 8;
 
-/// One number of each point of a block.
+/// One number for each point of a block.
 pub type Lanes = [f32; LANES];
 
 /// A function of each lane.
@@ -26,8 +26,8 @@ pub fn lanes_of(values: &[f32], block: usize, spare: f32) -> Lanes {
     }
 }
 
-/// A sum over points: in f64, for differences of such sums must keep their digits, lanes l and l + 4
-/// together, and always in the same order.
+/// A sum over points: in f64, as differences of such sums must keep their digits, lanes l and l + 4 together, and
+/// always in the same order.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct LaneSum([f64; LANES / 2]);
 
@@ -49,10 +49,10 @@ impl LaneSum {
 /// Translation, rotation, a, b, slopes of the gain.
 pub const NUM_UNKNOWNS: usize = 10;
 
-/// The first of the slopes among them; without these there are so many.
+/// Index of the first slope; without slopes, the number of unknowns.
 pub const FIRST_SLOPE: usize = 8;
 
-/// Places of a symmetric matrix's lower triangle.
+/// Entries of a symmetric matrix's lower triangle.
 pub const NUM_TRIANGLE: usize = NUM_UNKNOWNS * (NUM_UNKNOWNS + 1) / 2;
 
 /// Sums of a symmetric matrix and a vector of the unknowns of the pose and brightness.
@@ -72,13 +72,13 @@ impl Default for NormalSums {
 }
 
 impl NormalSums {
-    /// Adds a block to the place in row `r` and column `c` ≤ `r`.
+    /// Adds a block to the entry in row `r` and column `c` ≤ `r`.
     #[inline(always)]
     pub fn add_entry(&mut self, r: usize, c: usize, lanes: &Lanes) {
         self.triangle[r * (r + 1) / 2 + c].add(lanes);
     }
 
-    /// Adds a block to the vector.
+    /// Adds a block to entry `r` of the vector.
     #[inline(always)]
     pub fn add_row(&mut self, r: usize, lanes: &Lanes) {
         self.vector[r].add(lanes);
@@ -89,7 +89,7 @@ impl NormalSums {
         self.triangle[r * (r + 1) / 2 + c].total()
     }
 
-    /// The vector's sum.
+    /// The sum in row `r` of the vector.
     pub fn row(&self, r: usize) -> f64 {
         self.vector[r].total()
     }

@@ -1,7 +1,7 @@
-//! Which motion has been ahead of its rivals since the first frame.
+//! Tracks which motion has been ahead of its rivals since the first frame.
 //!
-//! One frame alone may prefer the wrong one: where many depths have ended in wrong minima the right motion loses what it
-//! was ahead.
+//! A single frame may prefer the wrong one: where many depths have ended in wrong minima the right motion loses its
+//! lead.
 
 use nalgebra::Vector3;
 
@@ -12,15 +12,15 @@ use crate::slam::two_frame::hypothesis::RIVAL_COSINE;
 pub(super) struct Lead {
     /// Direction of the translation.
     heading: Vector3<f64>,
-    /// Sum of its excesses over its rivals, less theirs over it.
+    /// Sum of its excesses over its rivals, minus theirs over it.
     excess: f64,
 }
 
 impl Lead {
-    /// Takes in the best motion of a frame and the excess of its rival's energy; whether it is ahead in all frames
-    /// together.
+    /// Adds the best motion of a frame and the excess of its rival's energy; returns whether it is ahead over all
+    /// frames together.
     pub(super) fn observe(&mut self, heading: &Vector3<f64>, excess: f64) -> bool {
-        // What is not a number says nothing.
+        // NaN counts as no excess.
         let excess = excess.max(0.0);
         let is_same = heading.dot(&self.heading) >= RIVAL_COSINE;
         if !is_same && excess < self.excess {

@@ -1,4 +1,4 @@
-//! What a start comes to.
+//! Results of a start.
 
 use nalgebra::Matrix6;
 
@@ -6,45 +6,45 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::pose::Brightness;
 use crate::slam::two_frame::evidence::{Evidence, Waiting};
 
-/// Why a start is given up; the frame that showed it is the new first frame.
+/// Why a start is given up; the frame that caused it is the new first frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Failure {
     /// Too many frames without proof.
     TooLong,
     /// The frames no longer show what the first one does.
     Mismatch,
-    /// The frame has another size than the intrinsics say. Nothing is begun on it.
+    /// The size of the frame differs from the intrinsics. It does not become a first frame.
     WrongSize,
 }
 
-/// Where a start stands.
+/// The state of a start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InitState {
-    /// Not proven yet, and by what.
+    /// Not proven yet, and the missing part.
     Waiting(Waiting),
     /// Parallax is proven: pose and depths can be used.
     Proven,
-    /// Given up and begun again.
+    /// Given up and restarted.
     Failed(Failure),
 }
 
-/// What one frame came to.
+/// The outcome of one frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InitOutcome {
-    /// Where the start stands.
+    /// The state of the start.
     pub state: InitState,
     /// The figures behind it.
     pub evidence: Evidence,
-    /// How many frames after the first one this frame is; 0 where it is the new first one itself.
+    /// Number of frames since the first one; 0 where this is the new first frame.
     pub frames: u32,
-    /// Pose of the frame, in units in which the points' mean inverse depth is 1.
+    /// Pose of the frame, in the unit for which the points' mean inverse depth is 1.
     pub first_from_current: SE3,
     /// Brightness of the frame against the first.
     pub brightness: Brightness,
     /// Covariance of the left increment (translation, rotation) of its inverse, with the length of the translation
-    /// held: the common errors of the depths come from it.
+    /// held: the source of the common errors of the depths.
     pub pose_covariance: Matrix6<f64>,
-    /// How far the rotation that explains the frame best moves the middle of the image, pixels.
+    /// Displacement of the image centre by the rotation that best explains the frame, pixels.
     pub rotation_px: f64,
 }
 

@@ -1,5 +1,4 @@
-//! The points of the first frame: where they are, what they look like at each level, which are
-//! neighbours.
+//! The points of the first frame: their positions, their patches at each level, and their neighbours.
 
 use crate::slam::depth::candidate::{CandidateParams, CandidateSelector};
 use crate::slam::depth::gradient_image::GradientImage;
@@ -9,10 +8,10 @@ use crate::slam::image::buffer::Image;
 use crate::slam::image::pyramid::Pyramid;
 use crate::slam::two_frame::lanes::{LANES, Lanes};
 
-/// Neighbours that a point's depth is smoothed with.
+/// Neighbours that smooth a point's depth.
 pub const NUM_NEIGHBOURS: usize = 8;
 
-/// A block of points as one pyramid level shows them.
+/// A block of points at one pyramid level.
 #[derive(Debug, Clone, Copy)]
 pub struct PatchBlock {
     /// Columns at the level.
@@ -27,7 +26,7 @@ pub struct PatchBlock {
     pub weight: Lanes,
 }
 
-/// The nearest other points of a block of points: of each neighbour the lanes' indices.
+/// The nearest other points of a block of points: for each neighbour the lanes' indices.
 pub type NeighbourBlock = [[u32; LANES]; NUM_NEIGHBOURS];
 
 /// The points of the first frame.
@@ -37,13 +36,13 @@ pub struct Points {
     pub pixels: Vec<(u16, u16)>,
     /// The points' patches, finest level first.
     pub patches: Vec<Vec<PatchBlock>>,
-    /// The nearest other points of each.
+    /// The nearest other points of each point.
     pub neighbours: Vec<NeighbourBlock>,
     selector: CandidateSelector,
 }
 
 impl Points {
-    /// Chooses the points of a frame and takes their patches; how many there are.
+    /// Chooses the points of a frame and takes their patches; returns their number.
     pub fn choose(
         &mut self,
         image: &GradientImage,
@@ -78,7 +77,7 @@ impl Points {
     }
 }
 
-/// The patches of a block; a lane to spare weighs nothing.
+/// The patches of a block; unused lanes have no weight.
 fn patches_at(image: &Image<f32>, level: usize, pixels: &[(u16, u16)]) -> PatchBlock {
     let empty = [0.0; LANES];
     let mut block = PatchBlock {
@@ -101,7 +100,7 @@ fn fill_lane(
     level: usize,
     (u, v): (u16, u16),
 ) {
-    /// The pattern reaches 2 pixels, its gradient 1.
+    /// The pattern extends 2 pixels, its gradient 1.
     const REACH_PX: f32 = 3.0;
     let shrink = f32::powi(0.5, level as i32);
     let (u, v) = ((f32::from(u) + 0.5) * shrink - 0.5, (f32::from(v) + 0.5) * shrink - 0.5);
@@ -138,9 +137,8 @@ fn nearest(pixels: &[(u16, u16)], i: usize) -> [u32; NUM_NEIGHBOURS] {
     found.map(|f| f.1)
 }
 
-/// Levels down to about 80 pixels across: a tenth of the image then moves by a few pixels. The shorter side
-/// bounds only stripes: a car's camera is four times as wide as high, and at 1.2 m a frame the road needs
-/// all levels.
+/// Levels down to about 80 pixels across: a tenth of the image then moves by a few pixels. The shorter side limits only
+/// strips: a car's camera is four times as wide as high, and at 1.2 m per frame the road needs all levels.
 pub(super) fn num_levels(intrinsics: &Intrinsics) -> usize {
     const MIN_LONG_SIDE: usize = 64;
     const MIN_SHORT_SIDE: usize = 20;

@@ -1,4 +1,4 @@
-//! Samples of a frame with their gradients, for the vector units that the processor has.
+//! Samples of a frame with their gradients, for the vector units of the processor.
 
 #[cfg(target_arch = "x86_64")]
 use std::arch::x86_64::*;
@@ -7,9 +7,9 @@ use crate::slam::image::buffer::Image;
 use crate::slam::kernel::Instructions;
 use crate::slam::two_frame::lanes::{LANES, Lanes, lanes};
 
-/// Samples with their gradients: bilinear between the pixels, of the grey values and of their central
-/// differences, which needs the 4×4 pixels around a position. At least a pixel inside the border;
-/// elsewhere the values are some pixels'.
+/// Samples with their gradients: bilinear between the pixels, of the grey values and of their central differences,
+/// which needs the 4×4 pixels around a position. Valid at least a pixel inside the border; elsewhere the values are
+/// those of some other pixels.
 pub(super) trait WindowSampler: Copy {
     /// Brightness, ∂I/∂u, ∂I/∂v.
     fn sample(self, image: &Image<f32>, u: &Lanes, v: &Lanes) -> [Lanes; 3];
@@ -20,14 +20,14 @@ impl<I: Instructions> WindowSampler for I {
     fn sample(self, image: &Image<f32>, u: &Lanes, v: &Lanes) -> [Lanes; 3] {
         #[cfg(target_arch = "x86_64")]
         if I::HAS_AVX2 {
-            // SAFETY: who made the instructions vouched for them.
+            // SAFETY: whoever made the instructions vouched for them.
             return unsafe { sample_avx2(image, u, v) };
         }
         sample_portable(image, u, v)
     }
 }
 
-/// The explanation of the other.
+/// The portable version, which explains the other.
 #[inline(always)]
 fn sample_portable(image: &Image<f32>, u: &Lanes, v: &Lanes) -> [Lanes; 3] {
     let (pixels, width) = (image.pixels(), image.width());
@@ -53,7 +53,7 @@ fn sample_portable(image: &Image<f32>, u: &Lanes, v: &Lanes) -> [Lanes; 3] {
     across(&fu, &columns)
 }
 
-/// Index of the last pixel that has 3 rows and 4 columns behind it.
+/// Index of the last pixel that is followed by 3 rows and 4 columns.
 #[inline(always)]
 fn last_window(image: &Image<f32>) -> u32 {
     let behind = 3 * image.width() + 4;
@@ -61,7 +61,7 @@ fn last_window(image: &Image<f32>) -> u32 {
     image.pixels().len().checked_sub(behind).expect("a level holds a window") as u32
 }
 
-/// From the four columns of brightness and the inner two of the doubled vertical slope.
+/// Interpolates between the four columns of brightness and the inner two of the doubled vertical slope.
 #[inline(always)]
 fn across(fu: &Lanes, [a0, a1, a2, a3, b1, b2]: &[Lanes; 6]) -> [Lanes; 3] {
     [
@@ -77,15 +77,15 @@ fn across(fu: &Lanes, [a0, a1, a2, a3, b1, b2]: &[Lanes; 6]) -> [Lanes; 3] {
 /// Rows of four pixels at a time.
 ///
 /// # Safety
-/// The processor has AVX2. Without the attribute that says so, because only that goes into the loop of
-/// the caller whatever its size.
+/// The processor has AVX2. There is no target-feature attribute, because only without it is this inlined into the
+/// caller's loop whatever its size.
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
 unsafe fn sample_avx2(image: &Image<f32>, u: &Lanes, v: &Lanes) -> [Lanes; 3] {
     let (pixels, width) = (image.pixels(), image.width());
     let last = last_window(image);
-    // SAFETY: AVX2 is this function's contract. Loads and stores are of arrays of eight, or of four
-    // pixels in rows 0 to 3 behind an index that has 3 rows and 4 pixels behind it.
+    // SAFETY: AVX2 is this function's contract. Loads and stores are of arrays of eight, or of four pixels in rows 0 to
+    // 3 from an index that is followed by 3 rows and 4 pixels.
     unsafe {
         let (u, v) = (_mm256_loadu_ps(u.as_ptr()), _mm256_loadu_ps(v.as_ptr()));
         let (column, row) = (_mm256_cvttps_epi32(u), _mm256_cvttps_epi32(v));

@@ -6,22 +6,22 @@ use crate::slam::depth::gaussian::NEW_VALIDITY;
 use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::two_frame::InitialDepth;
 
-/// Side of the cells in which points are looked up, pixels; neighbours are found one cell away at most.
+/// Side of the cells for looking up points, pixels; neighbours are found at most one cell away.
 const CELL_PX: usize = 16;
-/// Points that a pixel takes its depth from.
+/// Points from which a pixel takes its depth.
 const NUM_NEAREST: usize = 4;
-/// Standard deviation by which inverse depths of a surface differ, a pixel of distance, relative.
+/// Standard deviation of the difference of a surface's inverse depths per pixel of distance, relative.
 const SLOPE_STD_DEV_RATIO: f32 = 0.002;
 
 /// Variance of a pixel over the mean squared difference of the points around it: it lies between them, and mostly on
-/// the surface of the nearest. Chosen by the share of truth within one σ on recordings with depth.
+/// the surface of the nearest. Chosen by the share of true depths within one σ on recordings with depth.
 const SPREAD_RATIO: f32 = 0.15;
 
 /// Standard deviation of a pixel with a single point near it, relative.
 const LONELY_STD_DEV_RATIO: f32 = 0.2;
 
-/// Gives every candidate of `map` near a point a hypothesis: the nearest point's inverse depth, its
-/// variance widened by the distance and by how much the nearest points differ.
+/// Gives every candidate of `map` near a point a hypothesis: the nearest point's inverse depth, with a variance
+/// increased by the distance and the differences between the nearest points.
 pub fn spread(depths: &[InitialDepth], map: &mut DepthMap) {
     let (width, height) = (map.image.width(), map.image.height());
     let (columns, rows_of_cells) = (width.div_ceil(CELL_PX), height.div_ceil(CELL_PX));
@@ -86,7 +86,7 @@ fn hypothesis_from(depths: &[InitialDepth], nearest: &[(f32, usize); NUM_NEAREST
         independent: variance - point.variance,
         smoothed: point.inverse_depth,
         validity: NEW_VALIDITY,
-        // The pixels around a point have not been looked for in the second frame.
+        // The pixels around a point have not been searched in the second frame.
         propagated: on_point,
         failures: 0,
     }

@@ -9,11 +9,10 @@
 //! ∂r/∂δ = (d j, q × j)     ∂r/∂d = j·t     ∂r/∂(a, b, s) = (−c, −1, −c x)
 //! ```
 //!
-//! δ = (translation, rotation), `current_from_first ← exp(δ) current_from_first`. The slope s of the gain, over x and y of
-//! the rays, is what a vignette comes to where the image moves across it. All of it stays finite
-//! at d = 0, a point at infinity. Residuals and gradients are those of each sample; what moves the
-//! projection is taken at the point itself for its whole pattern (Engel, Koltun, Cremers 2018 §2.3), so
-//! that a sample adds to 14 sums and not to 80.
+//! δ = (translation, rotation), `current_from_first ← exp(δ) current_from_first`. The slope s of the gain, over x and y
+//! of the rays, models a vignette when the image moves across it. All of it stays finite at d = 0, a point at infinity.
+//! Residuals and gradients are those of each sample; the derivatives of the projection are taken at the point itself
+//! for its whole pattern (Engel, Koltun, Cremers 2018 §2.3), so that a sample adds to 14 sums and not to 80.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -38,8 +37,8 @@ pub struct LevelView<'a> {
     pub patches: &'a [PatchBlock],
 }
 
-/// The part of the normal equations that belongs to the points of a block; all 0 where a point is not
-/// visible, but its energy.
+/// The part of the normal equations that belongs to the points of a block; all 0 where a point is not visible, except
+/// for its energy.
 #[derive(Debug, Clone, Copy)]
 pub struct SystemBlock {
     /// Σ w ∂r/∂(pose, brightness) ∂r/∂d.
@@ -50,9 +49,9 @@ pub struct SystemBlock {
     pub gradient: Lanes,
     /// Σ ρ(r), weighted.
     pub energy: Lanes,
-    /// Σ of the weights of the samples, Huber's not included.
+    /// Σ of the weights of the samples, without Huber's.
     pub weight: Lanes,
-    /// Speed of the projection, pixels of the level a unit of inverse depth, squared.
+    /// Squared speed of the projection, pixels of the level per unit of inverse depth.
     pub squared_speed: Lanes,
     /// Whether the whole pattern falls into the current frame.
     pub visible: [bool; LANES],
@@ -82,7 +81,7 @@ pub struct PointSystem {
 pub struct System {
     /// The points' parts.
     pub blocks: Vec<SystemBlock>,
-    /// How many points there are.
+    /// Number of points.
     pub num_points: usize,
     /// JᵀWJ of pose and brightness.
     pub hessian: SMatrix<f64, NUM_UNKNOWNS, NUM_UNKNOWNS>,
@@ -91,14 +90,14 @@ pub struct System {
     /// Energy of all points; one out of view costs as much as a bad match, so that nothing is gained by
     /// looking away.
     pub energy: f64,
-    /// Points in view.
+    /// Number of points in view.
     pub num_visible: usize,
     /// Whether the slopes of the gain are among the unknowns; where they are held their rows are zero.
     pub has_slopes: bool,
 }
 
 impl System {
-    /// How many of the unknowns are not held; these come first.
+    /// Number of free unknowns; these come first.
     pub fn num_unknowns(&self) -> usize {
         if self.has_slopes { NUM_UNKNOWNS } else { FIRST_SLOPE }
     }
@@ -151,7 +150,7 @@ impl System {
     }
 }
 
-/// Energies of two motions in one frame, of the points that both see: what one does not see says nothing, and where the
+/// Energies of two motions in one frame, over the points that both see: an unseen point tells nothing, and where the
 /// images fit badly it would be cheaper than a match.
 pub fn compare(one: &System, other: &System) -> [f64; 2] {
     let mut sums = [0.0; 2];
@@ -171,7 +170,7 @@ const HIDDEN_ENERGY: f32 = PATTERN.len() as f32 * HUBER_GREY * HUBER_GREY;
 struct Geometry {
     rotation: [[f32; 3]; 3],
     translation: [f32; 3],
-    /// What the samples of the pattern add to q.
+    /// Offsets of q for the samples of the pattern.
     offsets: [[f32; 3]; 8],
     fx: f32,
     fy: f32,
@@ -210,7 +209,7 @@ impl Geometry {
     }
 
     /// The gains of points on the rays, and the derivatives of their logarithms by the slopes. The exponential is its
-    /// series to the second order, which is never below ½.
+    /// second-order series, which is never below ½.
     #[inline(always)]
     fn gains(&self, rays: &[Lanes; 2]) -> (Lanes, Option<[Lanes; 2]>) {
         let Some([by_x, by_y]) = self.gain_slopes else { return ([self.gain; LANES], None) };
@@ -229,7 +228,7 @@ impl Geometry {
         [0, 1, 2].map(|r| lanes(|l| m[r][0] * x[l] + m[r][1] * y[l] + m[r][2] + t[r] * d[l]))
     }
 
-    /// Where sample `k` of points at `q` falls: column, row, and its depth ratio.
+    /// Projection of sample `k` of points at `q`: column, row, and its depth ratio.
     #[inline(always)]
     fn project(&self, q: &[Lanes; 3], k: usize) -> [Lanes; 3] {
         let offset = &self.offsets[k];
@@ -241,9 +240,9 @@ impl Geometry {
     }
 }
 
-/// Sums over the samples of each point's pattern. w is the weight with Huber's.
+/// Sums over the samples of each point's pattern. w is the weight including Huber's.
 struct PatternSums {
-    /// ∂ ln c/∂s, of which all slopes of c are multiples; `None` where s is held.
+    /// ∂ ln c/∂s, of which all derivatives of c by s are multiples; `None` where s is held.
     by_slopes: Option<[Lanes; 2]>,
     /// q of the point itself.
     q: [Lanes; 3],
@@ -301,7 +300,7 @@ impl PatternSums {
         sums
     }
 
-    /// Adds a sample of each point, of residual `r`.
+    /// Adds a sample of each point, with residual `r`.
     #[inline(always)]
     fn add_sample(&mut self, r: &Lanes, [gu, gv]: [&Lanes; 2], c: &Lanes, weight: &Lanes) {
         let huber = lanes(|l| {
@@ -330,7 +329,7 @@ impl PatternSums {
         }
     }
 
-    /// The normal equations of the block; the pose's go to `normal`.
+    /// The normal equations of the block; those of the pose are added to `normal`.
     #[inline(always)]
     fn expand(
         mut self,
@@ -351,7 +350,7 @@ impl PatternSums {
             information: lanes(|l| {
                 let squared = (uu[l] * speed_u[l] + 2.0 * uv[l] * speed_v[l]) * speed_u[l]
                     + vv[l] * speed_v[l] * speed_v[l];
-                // A sum of squares: what rounding leaves of terms that cancel is none.
+                // A sum of squares: rounding of terms that cancel must not make it negative.
                 squared.max(0.0)
             }),
             gradient: lanes(|l| ru[l] * speed_u[l] + rv[l] * speed_v[l]),
@@ -362,8 +361,7 @@ impl PatternSums {
         }
     }
 
-    /// Leaves of the points out of view their energy: what such a lane holds may not be finite, and 0 times that
-    /// is not 0.
+    /// Clears all but the energy of the points out of view: their lanes may not be finite, and 0 times that is not 0.
     #[inline(always)]
     fn clear_hidden(&mut self, patch: &PatchBlock) {
         let visible = self.visible;
@@ -384,7 +382,7 @@ impl PatternSums {
         ];
     }
 
-    /// Adds to the normal equations of pose and brightness; their products with ∂r/∂d.
+    /// Adds to the normal equations of pose and brightness; returns their products with ∂r/∂d.
     #[inline(always)]
     fn add_to(&self, normal: &mut NormalSums, motion: &Displacement) -> [Lanes; NUM_UNKNOWNS] {
         let Displacement { by_u, by_v, speed_u, speed_v } = motion;
@@ -435,17 +433,17 @@ impl PatternSums {
     }
 }
 
-/// How points move in the image.
+/// Derivatives of the points' projections.
 struct Displacement {
-    /// With each unknown of the pose, pixels.
+    /// By each unknown of the pose, pixels.
     by_u: [Lanes; 6],
     by_v: [Lanes; 6],
-    /// With inverse depth, pixels.
+    /// By inverse depth, pixels.
     speed_u: Lanes,
     speed_v: Lanes,
 }
 
-/// How points at `q` of inverse depth `d` move.
+/// Derivatives for points at `q` of inverse depth `d`.
 #[inline(always)]
 fn displacement(geometry: &Geometry, q: &[Lanes; 3], d: &Lanes) -> Displacement {
     let t = &geometry.translation;

@@ -1,4 +1,4 @@
-//! What goes over all points, compiled for the vector units that the processor has.
+//! Loops over all points, compiled for the vector units of the processor.
 //!
 //! One source for all: no operation is fused or reordered, so every version gives the same bits.
 
@@ -9,7 +9,7 @@ use crate::slam::two_frame::state::State;
 use crate::slam::two_frame::system::{LevelView, System};
 
 impl System {
-    /// Evaluates every point at `state`. Sums go in the order of the points.
+    /// Evaluates every point at `state`. Sums are in the order of the points.
     pub fn evaluate(&mut self, level: &LevelView<'_>, state: &State) {
         Kernel::fastest().run(Evaluation { system: self, level, state });
     }

@@ -1,4 +1,4 @@
-//! Tests of the two-frame start on an analytic room: what must start does, what must not does not.
+//! Tests of the two-frame start in an analytic room: what must start does, what must not does not.
 
 use nalgebra::Vector6;
 
@@ -6,7 +6,7 @@ use super::*;
 use crate::slam::image::buffer::Image;
 use crate::slam::test_scene::{CAMERA, Random, Scene};
 
-/// How the camera moves a frame.
+/// Motion of the camera per frame.
 #[derive(Debug, Clone, Copy)]
 enum Motion {
     Sideways,
@@ -16,7 +16,7 @@ enum Motion {
     Standing,
 }
 
-/// The twist of one frame: 6 mm and up to 0.3°, directions by the seed.
+/// The twist of one frame: 6 mm and up to 0.3°, with directions from the seed.
 fn twist(motion: Motion, seed: u64) -> Vector6<f64> {
     let mut random = Random::new(seed);
     let angle = std::f64::consts::TAU * random.uniform();
@@ -45,7 +45,7 @@ struct Started {
     relief: f64,
 }
 
-/// Runs up to `frames` frames; the figures of the first proof, and all outcomes.
+/// Runs up to `frames` frames; returns the figures of the first proof, and all outcomes.
 fn run(
     motion: Motion,
     seed: u64,
@@ -134,7 +134,7 @@ fn relief(initializer: &TwoFrameInitializer, truth: &Image<f32>, scale: f64) -> 
     sums.0 / sums.1
 }
 
-/// Starts of a motion in four rooms: what each came to, and that the scene is not flattened.
+/// Checks the starts of a motion in four rooms: their results, and that the scene is not flattened.
 fn assert_starts(motion: Motion) {
     let mut reliefs = Vec::new();
     for seed in 1..=4 {
@@ -146,14 +146,14 @@ fn assert_starts(motion: Motion) {
             "{motion:?} {seed}: {}",
             started.median_depth_error
         );
-        // With 2 px of parallax and 0.2 px of noise the direction is good to a tenth of a radian.
+        // With 2 px of parallax and 0.2 px of noise the direction is accurate to a tenth of a radian.
         let direction_deg = if started.is_early { 12.0 } else { 5.0 };
         assert!(
             started.direction_error_deg <= direction_deg,
             "{motion:?} {seed}: {}",
             started.direction_error_deg
         );
-        // Variances are honest within a factor of two of the standard deviation.
+        // Variances are right within a factor of two of the standard deviation.
         assert!(
             started.within_two_sigmas >= 0.65,
             "{motion:?} {seed}: {}",
@@ -180,23 +180,23 @@ fn mixed_motion_starts() {
 }
 
 #[test]
-fn a_standing_camera_never_starts_whatever_the_noise() {
+fn a_stationary_camera_never_starts_whatever_the_noise() {
     for (seed, noise) in [(1, 0.0), (2, 2.0), (3, 4.0)] {
         let (started, _) = run(Motion::Standing, seed, noise, 200);
         assert!(started.is_none(), "noise {noise}");
     }
 }
 
-/// Three more in the simulator: `tests/estimation/two_frame_start.rs`.
+/// Three more are in the simulator: `tests/estimation/two_frame_start.rs`.
 #[test]
-fn a_turning_camera_never_starts() {
+fn a_rotating_camera_never_starts() {
     for seed in 1..=2 {
         let (started, _) = run(Motion::Turning, seed, 2.0, 60);
         assert!(started.is_none(), "seed {seed}");
     }
 }
 
-/// The room from two places, 6 cm apart and slightly turned.
+/// The room from two positions, 6 cm apart and slightly rotated.
 pub(super) fn two_views(noise: f64) -> (Vec<u8>, Vec<u8>, SE3) {
     let scene = Scene::new(5);
     let moved = SE3::exp(&Vector6::new(0.06, 0.01, 0.02, 0.004, -0.006, 0.002));
@@ -205,7 +205,7 @@ pub(super) fn two_views(noise: f64) -> (Vec<u8>, Vec<u8>, SE3) {
 }
 
 #[test]
-fn derivatives_are_those_of_the_residuals() {
+fn derivatives_match_those_of_the_residuals() {
     use crate::slam::two_frame::lanes::{FIRST_SLOPE, NUM_UNKNOWNS};
     use crate::slam::two_frame::system::System;
     let (first, second, moved) = two_views(0.0);
@@ -248,7 +248,7 @@ fn derivatives_are_those_of_the_residuals() {
         let expected = 2.0 * at.gradient[unknown];
         let scale = (at.hessian[(unknown, unknown)] * at.energy).sqrt();
         assert!((slope - expected).abs() < 0.05 * scale, "{unknown}: {slope} {expected} {scale}");
-        // Not vacuous: the slope is far from zero for the turn and the brightness.
+        // Not vacuous: the slope is far from zero for the rotation and the brightness.
         assert!(unknown != 7 || expected.abs() > 0.05 * scale);
     }
     let shifted = |change: f32| {
@@ -268,12 +268,12 @@ fn derivatives_are_those_of_the_residuals() {
 }
 
 #[test]
-fn earlier_frames_tell_true_depths_from_those_of_another_motion() {
+fn earlier_frames_distinguish_true_depths_from_those_of_another_motion() {
     let scene = Scene::new(5);
     let first = scene.render(&CAMERA, &SE3::identity());
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
     assert!(initializer.begin(&first.noisy(2.0, 1)));
-    // A path that bends: depths that only fit one of its steps do not fit the others.
+    // A path that bends: depths that fit only one of its steps do not fit the others.
     for (frame, twist) in
         [[0.03, 0.0, 0.0], [0.02, 0.03, 0.0], [0.0, 0.02, 0.03]].iter().enumerate()
     {
@@ -310,7 +310,7 @@ fn a_start_fills_the_depth_map_around_its_points() {
     initializer.fill(&mut map);
     let candidates = map.candidates.pixels().iter().filter(|c| **c).count();
     assert!(map.num_hypotheses() * 10 > candidates * 9, "{} of {candidates}", map.num_hypotheses());
-    // The points hold what the second frame says, the pixels around them do not.
+    // The points were observed in the second frame, the pixels around them were not.
     let points: Vec<_> = initializer.depths().map(|d| (d.u, d.v)).collect();
     for (v, u) in (0..CAMERA.height).flat_map(|v| (0..CAMERA.width).map(move |u| (v, u))) {
         let hypothesis = map.hypotheses.at(u, v);
@@ -346,7 +346,7 @@ fn a_start_is_repeatable_and_independent_of_the_threads() {
 }
 
 #[test]
-fn a_step_that_goes_too_far_is_damped_and_taken() {
+fn a_step_that_is_too_long_is_damped_and_taken() {
     let (first, _, _) = two_views(0.0);
     let dark: Vec<u8> = first.iter().map(|&grey| (f32::from(grey) / 3.0).round() as u8).collect();
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
@@ -381,7 +381,7 @@ fn earlier_frames_that_were_not_aligned_do_not_score() {
 }
 
 #[test]
-fn hostile_frames_are_refused_and_a_start_begins_again_by_itself() {
+fn unusable_frames_are_refused_and_a_start_restarts_itself() {
     let (first, second, _) = two_views(2.0);
     let blank = vec![100; first.len()];
     let params = TwoFrameParams { max_frames: 4, ..TwoFrameParams::default() };
@@ -390,7 +390,7 @@ fn hostile_frames_are_refused_and_a_start_begins_again_by_itself() {
     assert_eq!(initializer.step(&blank).state, InitState::Waiting(Waiting::Texture));
     assert!(!initializer.begin(&blank) && !initializer.begin(&[]));
     assert!(initializer.begin(&first));
-    // Something else altogether, three times: given up, and the last of it is the new first frame.
+    // A different scene, three times: given up, and the last of its frames is the new first frame.
     let other =
         Scene::new(77).render(&CAMERA, &SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 1.5, 0.0)));
     let states = [1, 2, 3].map(|seed| initializer.step(&other.noisy(2.0, seed)).state);
@@ -401,7 +401,7 @@ fn hostile_frames_are_refused_and_a_start_begins_again_by_itself() {
     assert!(initializer.begin(&first));
     let standing = [1, 2, 3, 4].map(|_| initializer.step(&first).state);
     assert_eq!(standing[3], InitState::Failed(Failure::TooLong));
-    // And it still starts.
+    // And it can still start.
     initializer.step(&second);
     assert_eq!(initializer.step(&second).state, InitState::Proven);
     let nonsense = TwoFrameParams { match_noise_px: f32::NAN, ..TwoFrameParams::default() };
@@ -437,7 +437,7 @@ fn every_version_of_the_sums_gives_the_same_bits() {
 }
 
 #[test]
-fn a_point_counts_as_it_does_alone() {
+fn a_point_counts_as_much_in_a_block_as_alone() {
     use crate::slam::two_frame::system::System;
     let (first, second, moved) = two_views(2.0);
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();

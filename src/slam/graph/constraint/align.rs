@@ -1,5 +1,5 @@
-//! Coarse to fine: iteratively re-weighted Gauss–Newton with Levenberg–Marquardt damping over the similarity and the
-//! brightness.
+//! Coarse-to-fine alignment: iteratively re-weighted Gauss–Newton with Levenberg–Marquardt damping over the similarity
+//! and the brightness.
 
 use nalgebra::SMatrix;
 
@@ -21,7 +21,7 @@ pub(super) struct Sums {
     pub(super) energy: f64,
     /// Points compared.
     pub(super) compared: u32,
-    /// Of them those below the inlier gate.
+    /// How many of them are below the inlier gate.
     pub(super) inliers: u32,
 }
 
@@ -58,7 +58,7 @@ pub(super) fn sums(
         inliers: 0,
     };
     let gate = f64::from(params.alignment.inlier_gate).powi(2);
-    // On coarser levels the pose is not yet known well enough to tell.
+    // On coarser levels the pose is not yet accurate enough to tell.
     let is_finest = level == views[0].levels().start;
     for terms in at.terms() {
         let squared = terms.squared();
@@ -96,15 +96,15 @@ pub(super) fn sums(
         sums.gradient[k] += information * value;
         sums.energy += information * value * value;
     }
-    // Where no depth of j is met, nothing but this holds the scale.
+    // Where no depth of j is met, only this constrains the scale.
     let of_scale = 1.0 / (SCALE_PRIOR_STD_DEV * SCALE_PRIOR_STD_DEV);
     sums.information[(SCALE, SCALE)] += of_scale;
     sums
 }
 
-/// Standard deviation with which a step leaves ln s where it is: a unit that is e times as long.
+/// Standard deviation of the zero prior on a step of ln s: a unit that is e times as long.
 const SCALE_PRIOR_STD_DEV: f64 = 1.0;
-/// Longest step of a rotation, radians, and of ln s: beyond, the linearisation has nothing to do with the image.
+/// Longest step of a rotation, radians, and of ln s: beyond it the linearisation is meaningless.
 const LONGEST_STEP: f64 = 1.0;
 
 /// Solves one level from `state`; `None` where nothing is in view.
@@ -114,9 +114,9 @@ pub(super) fn solve_level(
     state: &State,
     params: &ConstraintParams,
 ) -> Option<(State, Sums)> {
-    /// Damping after the first step that failed, and below which it is taken for none.
+    /// Damping after the first failed step; at or below this it returns to zero.
     const FIRST_DAMPING: f64 = 0.2;
-    /// Steps that fail one after the other before a level is given up.
+    /// Consecutive failed steps before a level is given up.
     const MOST_FAILURES: u32 = 6;
     let weighed_at = *state;
     let mut best = (*state, sums(views, level, state, &weighed_at, params));
@@ -152,7 +152,7 @@ pub(super) fn solve_level(
     Some(best)
 }
 
-/// Solves all levels, each from the one before.
+/// Solves all levels from coarse to fine, each starting from the previous result.
 pub(super) fn descend(
     views: [&KeyframeView; 2],
     state: &State,
@@ -169,7 +169,7 @@ pub(super) fn descend(
 }
 
 impl ConstraintParams {
-    /// Huber's weight of a point whose whitened squared residual is this.
+    /// Huber weight of a point with this whitened squared residual.
     pub(super) fn huber_weight(&self, squared: f64) -> f64 {
         (f64::from(self.alignment.huber) / squared.sqrt()).min(1.0)
     }

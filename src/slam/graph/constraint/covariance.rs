@@ -1,11 +1,11 @@
-//! How sure an alignment is: the sandwich of the alignment of frames (`alignment/scatter.rs`) over the similarity, what the
-//! common depth errors of both keyframes do to it, and a displacement of the whole image.
+//! Covariance of an alignment: the sandwich of the alignment of frames (`alignment/scatter.rs`) over the similarity,
+//! the effect of the common depth errors of both keyframes, and a displacement of the whole image.
 //!
 //! ```text
 //! Σ = s² M⁻¹ (Σ g gᵀ) M⁻¹ + Σ_k (M⁻¹ H_k) P_k (M⁻¹ H_k)ᵀ + displacement + scale floor
 //! ```
-//! g are the gradients of the tiles of i's image, M the curvature, H_k how the gradient changes with tilt and relief of
-//! keyframe k, P_k their covariance. A constant error of depth is the keyframe's unit and is no error.
+//! g are the gradients of the tiles of i's image, M the curvature, H_k the derivative of the gradient by tilt and
+//! relief of keyframe k, P_k their covariance. A constant error of depth is the keyframe's unit and no error.
 
 use nalgebra::SMatrix;
 
@@ -22,7 +22,7 @@ use crate::slam::tracker::covariance_floor::displacement_covariance;
 /// Derivatives of the gradient by the modes of a keyframe.
 type ByModes = SMatrix<f64, UNKNOWNS, NUM_MODES>;
 
-/// How residuals scatter over the tiles of an image, and what common errors do.
+/// Scatter of the residuals over the tiles of an image, and the effect of common errors.
 pub(super) struct Scatter {
     tiles: Vec<Tile>,
     weights: f64,
@@ -35,12 +35,12 @@ pub(super) struct Scatter {
 #[derive(Clone, Default)]
 struct Tile {
     gradient: Row,
-    /// For its displacement, which the photometric residuals alone tell.
+    /// For its displacement, which only the photometric residuals reveal.
     shown: TileSum,
     compared: Comparison,
 }
 
-/// Sums for the correlation of the greys of two images.
+/// Sums for the correlation of the grey values of two images.
 #[derive(Clone, Copy, Default)]
 struct Comparison {
     count: f64,
@@ -59,11 +59,11 @@ impl Comparison {
         self.product += greys[0] * greys[1];
     }
 
-    /// Correlation; `None` where there are too few greys, or too even ones in the first image.
+    /// Correlation; `None` where there are too few grey values, or those of the first image are too uniform.
     fn correlation(&self) -> Option<f64> {
-        /// Fewer greys correlate by chance.
+        /// Fewer grey values correlate by chance.
         const LEAST_POINTS: f64 = 12.0;
-        /// Variance of greys, grey levels², that noise of the camera alone could give.
+        /// Variance of grey values, grey levels², that camera noise alone could cause.
         const LEAST_VARIANCE: f64 = 16.0;
         if self.count < LEAST_POINTS {
             return None;
@@ -71,23 +71,23 @@ impl Comparison {
         let mean = self.sums.map(|sum| sum / self.count);
         let variance = [0, 1].map(|k| self.squares[k] / self.count - mean[k] * mean[k]);
         let common = self.product / self.count - mean[0] * mean[1];
-        // What is even where texture was predicted does not agree.
+        // A uniform tile where texture was predicted does not agree.
         (variance[0] > LEAST_VARIANCE)
             .then(|| common / (variance[0] * variance[1].max(LEAST_VARIANCE)).sqrt())
     }
 }
 
-/// How far the tiles of two images agree.
+/// Agreement between the tiles of two images.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TileAgreement {
     /// Tiles with texture that are compared.
     pub tiles: u32,
-    /// Share of them whose greys correlate.
+    /// Share of them whose grey values correlate.
     pub share: f64,
 }
 
 impl Scatter {
-    /// Measured at a state, whose mode derivatives are taken for the depth of both views.
+    /// Measured at a state, at which the derivatives by the modes of both views are taken.
     pub(super) fn measure(
         views: [&KeyframeView; 2],
         level: usize,
@@ -107,8 +107,7 @@ impl Scatter {
         };
         /// Standard deviations within which depths agree, as for an inlier.
         const AGREES: f64 = 2.5;
-        /// And the largest difference, as a share, with which they agree at all: depth that is less sure agrees with
-        /// anything.
+        /// Largest relative difference at which they agree at all: uncertain depth would agree with anything.
         const LARGEST_DIFFERENCE: f64 = 0.2;
         for terms in at.terms() {
             let huber = params.huber_weight(terms.squared());
@@ -136,7 +135,7 @@ impl Scatter {
             let d = f64::from(terms.point.inverse_depth);
             let own = shape([terms.point.ray_x, terms.point.ray_y].map(f64::from), d) - centres[0];
             scatter.by_modes[0] += row * (weight * depth.by_log_depth) * own.transpose();
-            // Of j: the plane of its modes at the ray of p'.
+            // For j: the plane of its modes at the ray of p'.
             let [u, v] = terms.photometric.projection.map(f64::from);
             let theirs =
                 shape(intrinsics.ray(u, v).xy().into(), depth.other_inverse_depth) - centres[1];
@@ -182,9 +181,9 @@ impl Scatter {
         self.by_modes[0] += row * (weight * change) * own.transpose();
     }
 
-    /// How far the tiles agree.
+    /// Agreement between the tiles.
     pub(super) fn agreement(&self) -> TileAgreement {
-        /// Correlation of a tile's greys at which it agrees: two places have 0 to 0.5.
+        /// Correlation from which the grey values of a tile agree: two different places have 0 to 0.5.
         const AGREES: f64 = 0.7;
         let (mut tiles, mut agreeing) = (0u32, 0u32);
         for correlation in self.tiles.iter().filter_map(|tile| tile.compared.correlation()) {
@@ -210,7 +209,7 @@ impl Scatter {
             outer += tile.gradient * tile.gradient.transpose();
             count += 1;
         }
-        // Fewer tiles than unknowns scatter too little to tell.
+        // With fewer tiles than unknowns the scatter is not informative.
         outer += sums.information * (UNKNOWNS as f64 / f64::from(count.max(1)));
         let sandwich = inverse * outer * inverse / (curvature_ratio * curvature_ratio);
         let of_pose =
@@ -245,7 +244,7 @@ impl Scatter {
     }
 }
 
-/// φ of a ray and an inverse depth: what the modes are planes over.
+/// φ of a ray and an inverse depth: the coordinates over which the modes are planes.
 fn shape([x, y]: [f64; 2], inverse_depth: f64) -> nalgebra::Vector3<f64> {
     nalgebra::Vector3::new(x, y, inverse_depth.ln())
 }

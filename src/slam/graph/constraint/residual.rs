@@ -1,13 +1,13 @@
-//! What a point of keyframe i says about where keyframe j stands: a difference of brightness and one of inverse depth.
+//! Residuals of a point of keyframe i in keyframe j: a difference of brightness and one of inverse depth.
 //!
-//! The similarity is split into the rigid T = (R, t/s), in units of i, and ln s: p_j = s (T p_i). Images do not depend on
-//! s, so that the photometric residual is that of the tracker. With q = 1/z of T p_i and the pixel p' where it falls
+//! The similarity is split into the rigid T = (R, t/s), in units of i, and ln s: p_j = s (T p_i). Images do not depend
+//! on s, so the photometric residual is that of the tracker. With q = 1/z of T p_i and the pixel p' of its projection
 //! ```text
 //! r_d = ln(q/s) − ln d_j(p')     ∂r_d/∂δ = −(0, 0, q, n_y, −n_x, 0) − (∇d_j/d_j) ∂p'/∂δ     ∂r_d/∂ln s = −1
 //! σ_d² = V_j/d_j² + (∂r_d/∂ln d_i)² V_i/d_i² + model²
 //! ```
-//! (Engel, Schöps, Cremers 2014, §3.5, with the ratio of the inverse depths in place of their difference: to first order
-//! the same over d_j, but as much in one direction as in the other. A difference weighed by variances that come from the
+//! (Engel, Schöps, Cremers 2014, §3.5, with the ratio of the inverse depths in place of their difference: to first
+//! order the same over d_j, but symmetric in the two directions. A difference weighted by variances that come from the
 //! noisy depths themselves is biased by some of their squared errors, with opposite signs in the two directions.)
 //! d_j(p') is taken from the plane through the pixel with depth nearest to p'.
 
@@ -24,13 +24,13 @@ use crate::slam::pose::Brightness;
 
 /// Unknowns: left increment of T (translation, rotation), ln s, brightness a and b.
 pub(super) const UNKNOWNS: usize = 9;
-/// Place of ln s among them.
+/// Index of ln s among them.
 pub(super) const SCALE: usize = 6;
 
 /// A derivative by the unknowns.
 pub(super) type Row = SVector<f64, UNKNOWNS>;
 
-/// Where an alignment stands.
+/// The state of an alignment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct State {
     /// T: `j_from_i` in units of i.
@@ -54,7 +54,7 @@ impl State {
         Sim3::new(rigid, scale)
     }
 
-    /// After a step of the unknowns.
+    /// The state after a step of the unknowns.
     pub(super) fn moved(&self, step: &Row) -> Self {
         let Brightness { a, b } = self.brightness;
         Self {
@@ -69,7 +69,7 @@ impl State {
     }
 }
 
-/// What the depth of one point says.
+/// Residual of the depth of one point, and its derivatives.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct DepthTerms {
     /// r_d.
@@ -108,8 +108,8 @@ impl Terms {
 }
 
 impl DepthTerms {
-    /// Whether the depths cannot be of the same surface. One image hides what the other shows, always by something nearer:
-    /// a weight that only falls off would bias the scale, in both directions alike.
+    /// Whether the depths cannot be of the same surface. Occluders are always nearer: a weight that merely decreases
+    /// would bias the scale, in both directions alike.
     pub(super) fn is_hidden(&self) -> bool {
         /// Standard deviations.
         const SAME_SURFACE: f64 = 3.0;
@@ -135,7 +135,7 @@ pub(super) struct Level<'a> {
 }
 
 impl<'a> Level<'a> {
-    /// Of points of `i` in `j`; `weighed_at` is the state at which (∂r/∂d)² V is taken.
+    /// For points of `i` in `j`; `weighed_at` is the state at which (∂r/∂d)² V is evaluated.
     pub(super) fn new(
         [i, j]: [&'a KeyframeView; 2],
         level: usize,
@@ -155,7 +155,7 @@ impl<'a> Level<'a> {
         Self { view: i, image, depths, level, at, state: *state, depth_model_ratio }
     }
 
-    /// Terms of all points that fall into j and are not clipped there, in their order.
+    /// Terms of all points that project into j and are not clipped there, in their order.
     pub(super) fn terms(&self) -> impl Iterator<Item = Terms> {
         self.view.reference.level(self.level).iter().filter_map(|point| {
             let photometric = point_terms(self.image, &self.at, &point)?;

@@ -1,5 +1,5 @@
-//! Whether another place explains the images as well as the one that was found: where texture repeats, as along a
-//! corridor, an alignment says nothing of which repetition it has found.
+//! Checks whether another pose explains the images as well as the one that was found: where texture repeats, as along a
+//! corridor, an alignment does not tell which repetition it has found.
 
 use nalgebra::Vector3;
 
@@ -11,19 +11,19 @@ use super::view::KeyframeView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 
-/// Steps along an axis from the place that was found, mean depths, and how many either way: a repetition further away
-/// than that shows in less than half of the view.
+/// Step along an axis from the pose that was found, mean depths, and the number of steps either way: a repetition
+/// further away shows in less than half of the view.
 const STEP: f64 = 0.05;
 const STEPS: i32 = 14;
-/// Least number of steps to another place: nearer it is the same one.
+/// Least number of steps to another pose: nearer it is the same one.
 const LEAST_STEPS: i32 = 2;
-/// Places that are followed.
+/// Most poses that are refined.
 const MOST_FOLLOWED: usize = 4;
-/// Levels above the finest at which places are scanned, and at which they are judged.
+/// Levels above the finest at which poses are scanned, and at which they are judged.
 const SCANNED_ABOVE: usize = 2;
 const JUDGED_ABOVE: usize = 1;
 
-/// Whether there is such a place.
+/// Whether there is such a pose.
 pub(super) fn has_rival(
     views: [&KeyframeView; 2],
     j_from_i: &Sim3,
@@ -50,7 +50,7 @@ pub(super) fn has_rival(
     })
 }
 
-/// Places along an axis at which the cost is lower than at those beside them, with the cost.
+/// Poses along an axis with a lower cost than their neighbours, with that cost.
 fn minima(
     views: [&KeyframeView; 2],
     level: usize,
@@ -76,7 +76,7 @@ fn minima(
     costs.windows(3).filter(is_lowest).map(|around| around[1]).filter(is_apart).collect()
 }
 
-/// Whether a state is not the one that was found.
+/// Whether a state differs from the one that was found.
 fn is_elsewhere(views: [&KeyframeView; 2], found: &State, state: &State) -> bool {
     let difference = state.rigid.translation - found.rigid.translation;
     let distance = difference.norm() * views[0].reference.mean_inverse_depth();

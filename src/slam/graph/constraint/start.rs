@@ -1,4 +1,4 @@
-//! Where an alignment of two keyframes begins: around what is known, where their blurred images agree best.
+//! Initial value of an alignment of two keyframes: near a given estimate, where their blurred images agree best.
 
 use nalgebra::{UnitQuaternion, Vector3, Vector6};
 
@@ -12,20 +12,20 @@ use crate::slam::pose::Brightness;
 use crate::slam::tracker::motion::turned;
 use crate::slam::upper_median::upper_median;
 
-/// Turns that are tried around a rotation that is given, degrees: half a step of those that places are compared by.
+/// Rotations tried around a given one, degrees: half a step of those at which places are compared.
 const AROUND_DEG: f64 = 4.5;
-/// Translations that are tried with a turn that keeps the middle of the view about in place, mean depths.
+/// Translations tried together with a rotation that roughly keeps the centre of the view, mean depths.
 const ASIDE: f64 = 0.3;
-/// The same around a similarity that is given.
+/// The same around a given similarity.
 const GIVEN_DEG: f64 = 3.0;
 const GIVEN_ASIDE: f64 = 0.1;
-/// Starts that are followed down to the next finer level.
+/// Candidates that are refined on the next finer level.
 const MOST_FOLLOWED: usize = 3;
 
-/// What is known of a similarity before it is measured.
+/// Initial estimate of a similarity before it is measured.
 #[derive(Debug, Clone, Copy)]
 pub enum Start {
-    /// About how the cameras are turned, `j_from_i`, as of places that look alike.
+    /// Approximate rotation of the cameras, `j_from_i`, such as that of places that look alike.
     Rotation(UnitQuaternion<f64>),
     /// `j_from_i`.
     Similarity(Sim3),
@@ -55,7 +55,7 @@ pub(super) fn find(
         let state = State { log_scale: log_scale(views, coarsest, &state, params), ..state };
         solved.extend(follow(views, coarsest, &state, params));
     }
-    // What is not explained while the images are blurred will not be when they are sharp.
+    // An image that is not explained while blurred will not be when sharp.
     let least = params.gates.min_usage * params.gates.min_inliers;
     solved.retain(|(explained, _)| *explained >= least);
     solved.sort_by(|one, other| other.0.total_cmp(&one.0));
@@ -66,8 +66,8 @@ pub(super) fn find(
     best.filter(|(explained, _)| *explained >= least).map(|(_, state)| state)
 }
 
-/// Solves a level, with the share of all its points that are inliers; `None` where only a gain that is not plausible explains it, which
-/// would hide the right pose.
+/// Solves a level and returns the share of all its points that are inliers, with the state; `None` where only an
+/// implausible gain explains it, which would hide the right pose.
 fn follow(
     views: [&KeyframeView; 2],
     level: usize,
@@ -80,10 +80,10 @@ fn follow(
     is_even.then_some((explained, state))
 }
 
-/// Poses around one: turned by `degrees`, and moved by `aside`, units of i, with a turn that keeps the view.
+/// Poses around one: rotated by `degrees`, and moved by `aside`, units of i, with a rotation that keeps the view.
 fn around(at: &SE3, degrees: f64, aside: f64) -> Vec<SE3> {
     let turn_rad = degrees.to_radians();
-    // From the left, in the frame of j: turns of the camera about itself.
+    // From the left, in the axes of j: rotations of the camera about itself.
     let mut poses: Vec<SE3> = turned(&SE3::identity(), turn_rad).map(|turn| turn * *at).collect();
     for axis in [Vector3::x(), Vector3::y(), Vector3::z()] {
         for by in [-aside, aside] {
@@ -95,7 +95,7 @@ fn around(at: &SE3, degrees: f64, aside: f64) -> Vec<SE3> {
     poses
 }
 
-/// ln s with the median of the depth residuals taken off, over the points that meet depth: the scale that makes depths agree.
+/// ln s minus the median of the depth residuals over the points that meet depth: the scale at which depths agree.
 fn log_scale(
     views: [&KeyframeView; 2],
     level: usize,

@@ -1,4 +1,4 @@
-//! Keyframes of rendered rooms aligned to each other: derivatives, true loops, false ones.
+//! Keyframes of rendered rooms aligned to each other: derivatives, true loops, false loops.
 
 use std::sync::Arc;
 
@@ -16,10 +16,10 @@ use crate::slam::modes::ModeCovariance;
 use crate::slam::pose::Brightness;
 use crate::slam::test_scene::{CAMERA, Random, Scene};
 
-/// What is wrong with the depth of a keyframe.
+/// Errors of a keyframe's depth.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::slam) struct DepthError {
-    /// Standard deviation of each point for itself, share of its inverse depth.
+    /// Standard deviation of each point's independent error, share of its inverse depth.
     pub(in crate::slam) noise: f64,
     /// Standard deviation of tilt and relief.
     pub(in crate::slam) modes: f64,
@@ -71,7 +71,7 @@ pub(in crate::slam) fn keyframe(
     Keyframe { mode_covariance, ..Keyframe::at(place, CAMERA, points, image) }
 }
 
-/// Where a camera stands.
+/// The pose of a camera.
 fn at(twist: [f64; 6]) -> SE3 {
     SE3::exp(&Vector6::from(twist))
 }
@@ -84,14 +84,14 @@ fn truth(i: &Keyframe, j: &Keyframe) -> Sim3 {
     j.map_from_keyframe.inverse() * i.map_from_keyframe
 }
 
-/// The left increment by which a measurement errs.
+/// The left increment of a measurement's error.
 fn error(found: &Sim3, truth: &Sim3) -> Twist7 {
     (*found * truth.inverse()).log()
 }
 
 #[test]
-fn derivatives_of_depth_are_those_of_differences() {
-    /// Step of the unknowns; images are not concerned.
+fn derivatives_of_depth_match_finite_differences() {
+    /// Step of the unknowns; images are not involved.
     const STEP: f64 = 1e-4;
     let scene = Scene::new(3);
     let exact = DepthError { noise: 0.0, modes: 0.0 };
@@ -129,7 +129,7 @@ fn derivatives_of_depth_are_those_of_differences() {
             let numeric = (after.residual - before.residual) / (2.0 * STEP);
             let analytic = depth.row()[k];
             compared += 1;
-            // A point may fall onto another pixel's plane in between.
+            // In between, a point may project onto another pixel's plane.
             wrong += u32::from((numeric - analytic).abs() > 0.02 * analytic.abs().max(0.2));
         }
     }
@@ -138,11 +138,11 @@ fn derivatives_of_depth_are_those_of_differences() {
 }
 
 #[test]
-fn a_similarity_goes_through_the_state_and_back() {
+fn a_similarity_survives_the_round_trip_through_the_state() {
     let j_from_i = Sim3::new(at([0.3, -0.2, 0.5, 0.1, 0.4, -0.2]), 1.8);
     let state = State::of(&j_from_i);
     assert!(error(&state.j_from_i(), &j_from_i).norm() < 1e-12);
-    // The covariance's change of units: a step of T is a left increment whose translation counts in units of j.
+    // The covariance's change of units: a step of T is a left increment whose translation is in units of j.
     let mut step = Row::zeros();
     step.fixed_rows_mut::<7>(0).copy_from_slice(&[1e-5, 2e-5, -1e-5, 3e-5, -2e-5, 1e-5, 2e-5]);
     let moved = error(&state.moved(&step).j_from_i(), &j_from_i);
@@ -155,7 +155,7 @@ fn a_similarity_goes_through_the_state_and_back() {
     assert!(!broken.is_finite());
 }
 
-/// Cameras that look at the same place from `twist` apart, in units of `scale` to one.
+/// Measures cameras that see the same place from `twist` apart, in units of `scale` to one.
 fn measured(
     scenes: [&Scene; 2],
     twist: [f64; 6],
@@ -186,7 +186,7 @@ const WIDE: [[f64; 6]; 6] = [
     [0.0, 0.1, 0.1, 0.1, 0.2, -0.3],
 ];
 
-/// The one of them with the largest offset aside.
+/// The pose with the largest sideways offset.
 const WIDEST: usize = 4;
 
 #[test]
@@ -224,11 +224,11 @@ fn true_loops_are_accepted_at_wide_baselines_and_other_units() {
         }
     }
     assert!(refused.is_empty(), "{refused:?}");
-    // Of the widest one, which loses most of what is near, two thirds at most are refused.
+    // Of the widest one, which loses most of the near points, two thirds at most are refused.
     assert!(widest <= 4, "{widest} of 6");
 }
 
-/// What comes of two keyframes of which about the rotation is known.
+/// The outcome for two keyframes whose rotation is roughly known.
 fn outcome(i: &Keyframe, j: &Keyframe) -> Result<Measurement, Refusal> {
     let solver = solver();
     let views = [i, j].map(|keyframe| solver.view(keyframe));
@@ -276,7 +276,7 @@ fn a_corridor_that_repeats_is_ambiguous() {
 }
 
 #[test]
-fn a_picture_with_other_depth_and_a_mirrored_one_are_refused() {
+fn an_image_with_wrong_depth_and_a_mirrored_one_are_refused() {
     let i = keyframe(&Scene::new(3), &at([0.0; 6]), 2.5, &USUAL, 1);
     assert!(outcome(&i, &i.clone()).is_ok());
     let mut flat = i.clone();
@@ -289,7 +289,7 @@ fn a_picture_with_other_depth_and_a_mirrored_one_are_refused() {
 }
 
 #[test]
-fn what_cannot_be_used_is_refused() {
+fn unusable_keyframes_and_starts_are_refused() {
     let i = keyframe(&Scene::new(3), &at([0.0; 6]), 2.5, &USUAL, 1);
     let solver = solver();
     let view = solver.view(&i);
@@ -314,7 +314,7 @@ fn what_cannot_be_used_is_refused() {
 }
 
 #[test]
-fn errors_are_as_large_as_claimed() {
+fn errors_are_as_large_as_their_covariances() {
     const TIMES: u64 = 24;
     let mut sum = 0.0;
     let mut count = 0;
@@ -335,7 +335,7 @@ fn errors_are_as_large_as_claimed() {
 
 #[test]
 fn one_loop_makes_a_drifted_chain_consistent() {
-    /// Keyframes there and back, and how much each measurement of the next one errs, always alike.
+    /// Keyframes out and back, and the error of each measurement to the next one, always the same.
     const NUMBER: usize = 10;
     const DRIFT: [f64; 7] = [0.02, 0.01, 0.01, 0.004, 0.006, 0.002, 0.02];
     let scene = Scene::new(3);
@@ -365,7 +365,7 @@ fn one_loop_makes_a_drifted_chain_consistent() {
         error(graph.map_from_keyframe(ids[k]).unwrap(), &places[k]).norm()
     };
     let before: Vec<f64> = (1..NUMBER).map(|k| error_of(&graph, k)).collect();
-    // A kernel that gives false loops up gives up this one: it is much more certain than the chain has drifted.
+    // A kernel that rejects false loops would reject this one: it is much more certain than the chain has drifted.
     let (i, j, kernel) = (ids[0], ids[NUMBER - 1], RobustKernel::None);
     let information = found.covariance.cholesky().unwrap().inverse();
     let j_from_i = found.j_from_i;

@@ -1,9 +1,9 @@
-//! What two aligned keyframes must show to be taken for the same place. A false loop bends the whole map: what is in
-//! doubt is refused.
+//! Gates that two aligned keyframes must pass to count as the same place. A false loop distorts the whole map: doubtful
+//! ones are refused.
 
 use super::{KeyframeAlignment, Measurement};
 
-/// Bounds of what is accepted.
+/// Bounds for accepting a measurement.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GateParams {
     /// Fewest points of the finest level that are compared: nine unknowns need many times as many.
@@ -14,22 +14,22 @@ pub struct GateParams {
     pub min_usage: f64,
     /// Least share of inliers among them.
     pub min_inliers: f64,
-    /// Farthest that the cameras may be apart, mean depths: from afar the variance of depth explains any image.
+    /// Largest distance of the cameras, mean depths: from afar the variance of depth explains any image.
     pub max_distance: f64,
     /// Fewest tiles with texture.
     pub min_tiles: u32,
-    /// Least share of these in which the greys of both images correlate: what neither gain nor variance can feign.
+    /// Least share of these in which the images correlate: neither gain nor variance can imitate that.
     pub min_agreement: f64,
-    /// The same for another place that makes the measurement ambiguous.
+    /// The same for another pose that makes the measurement ambiguous.
     pub min_rival_agreement: f64,
     /// Least share of the points in view that meet depth.
     pub min_depth: f64,
-    /// Least share of those whose depths agree: another room may show the same pictures.
+    /// Least share of those whose depths agree: another room may look the same.
     pub min_depth_inliers: f64,
-    /// Largest squared normalised difference of both ways: χ²₇ at 99 %.
+    /// Largest squared normalised difference between the two directions: χ²₇ at 99 %.
     pub max_reciprocal_chi2: f64,
-    /// Largest standard deviation of translation in mean depths, of rotation in radians and of ln s: less sure, a
-    /// measurement holds nothing, and agrees with anything.
+    /// Largest standard deviation of translation in mean depths, of rotation in radians and of ln s: a less certain
+    /// measurement constrains nothing, and agrees with anything.
     pub max_std_dev: f64,
 }
 
@@ -52,7 +52,7 @@ impl Default for GateParams {
     }
 }
 
-/// Why no measurement is made.
+/// Why there is no measurement.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum Refusal {
     /// The keyframes are of cameras with different intrinsics.
@@ -61,10 +61,10 @@ pub enum Refusal {
     /// A keyframe has too few points with depth.
     #[error("a keyframe has too few points with depth")]
     TooFewPoints,
-    /// The similarity to begin with is none.
+    /// The initial similarity is invalid.
     #[error("the initial similarity is not finite or its scale is not positive")]
     InvalidStart,
-    /// No start makes the images alike.
+    /// No start makes the images agree.
     #[error("the images have nothing in common")]
     NothingAlike,
     /// No point falls into the other image.
@@ -76,7 +76,7 @@ pub enum Refusal {
     /// Images and depths do not determine the similarity.
     #[error("images and depths do not determine the similarity")]
     Undetermined,
-    /// The gain is no likely one.
+    /// The gain is implausible.
     #[error("the gain between the images is not plausible")]
     Gain,
     /// The cameras are too far apart.
@@ -91,16 +91,16 @@ pub enum Refusal {
     /// Tiles of the images do not correlate.
     #[error("the images do not agree")]
     ImagesDisagree,
-    /// Too little depth is met.
+    /// Too few points meet depth of the other keyframe.
     #[error("too little depth is in view of both keyframes")]
     LittleDepth,
     /// The depths contradict each other.
     #[error("the depths do not agree")]
     DepthsDisagree,
-    /// The two ways do not agree within what they claim.
+    /// The two directions do not agree within their covariances.
     #[error("both directions disagree: χ² is {0:.1}")]
     NotReciprocal(f64),
-    /// Another place explains the images as well: the texture repeats.
+    /// Another pose explains the images as well: the texture repeats.
     #[error("another place explains the images as well")]
     Ambiguous,
     /// The measurement is too uncertain to be of use.
@@ -124,12 +124,12 @@ impl GateParams {
         gates.iter().find(|(holds, _)| !holds).map_or(Ok(()), |&(_, refusal)| Err(refusal))
     }
 
-    /// Judges the difference of both ways.
+    /// Judges the difference between the two directions.
     pub(super) fn judge_reciprocity(&self, chi2: f64) -> Result<(), Refusal> {
         if chi2 <= self.max_reciprocal_chi2 { Ok(()) } else { Err(Refusal::NotReciprocal(chi2)) }
     }
 
-    /// Judges how sure the result is.
+    /// Judges the certainty of the result.
     pub(super) fn judge_certainty(
         &self,
         found: &Measurement,

@@ -1,4 +1,4 @@
-//! A keyframe prepared for being aligned to others, and others to it.
+//! A keyframe prepared for alignment to others, and of others to it.
 
 use crate::slam::alignment::fusion::LevelPoint;
 use crate::slam::alignment::reference::num_levels;
@@ -15,21 +15,21 @@ pub(super) struct Surface {
     pub(super) inverse_depth: f32,
     /// Its variance.
     pub(super) variance: f32,
-    /// Its change per pixel along u and v; 0 where the neighbours do not tell.
+    /// Its change per pixel along u and v; 0 where the neighbours do not determine it.
     pub(super) gradient: [f32; 2],
 }
 
-/// Depth of one level, to be looked up by pixel.
+/// Depth of one level, for lookup by pixel.
 #[derive(Debug, Clone, Default)]
 pub(super) struct DepthGrid {
     width: usize,
     surfaces: Vec<Surface>,
-    /// By pixel: one more than the surface at it or beside it, 0 where there is none.
+    /// By pixel: one more than the index of the surface at it or next to it, 0 where there is none.
     nearest: Vec<u32>,
 }
 
 impl DepthGrid {
-    /// Of the pixels with depth of a level.
+    /// From the pixels with depth of a level.
     pub(super) fn new(candidates: &[LevelPoint], width: usize, height: usize) -> Self {
         /// Neighbours of a pixel, those that share a side first.
         const BESIDE: [[isize; 2]; 8] =
@@ -76,7 +76,7 @@ impl DepthGrid {
         Self { width, surfaces, nearest }
     }
 
-    /// The surface at a pixel inside the image or beside it.
+    /// The surface at a pixel inside the image, or next to that pixel.
     #[inline]
     pub(super) fn at(&self, u: f32, v: f32) -> Option<&Surface> {
         let at = (v + 0.5) as usize * self.width + (u + 0.5) as usize;
@@ -84,9 +84,9 @@ impl DepthGrid {
     }
 }
 
-/// Least-squares gradient of the inverse depth over those of the neighbours that can be of the same surface.
+/// Least-squares gradient of the inverse depth over the neighbours that can lie on the same surface.
 fn gradient<'a>(centre: &Surface, others: impl Iterator<Item = &'a Surface>) -> [f32; 2] {
-    /// Larger changes of inverse depth to a neighbour, as a share of it, are those to another surface.
+    /// Larger relative changes of inverse depth to a neighbour mean another surface.
     const SAME_SURFACE: f32 = 0.1;
     /// Least determinant of the sums of squares: six pixels around a corner.
     const LEAST_DETERMINANT: f32 = 20.0;
@@ -119,8 +119,8 @@ pub struct KeyframeView {
 }
 
 impl KeyframeView {
-    /// Prepares a keyframe. One without image or depth, or with an image of another size than its intrinsics, has no
-    /// points, and every measurement with it is refused.
+    /// Prepares a keyframe. Without image or depth, or with an image whose size differs from its intrinsics, the view
+    /// has no points, and every measurement with it is refused.
     pub fn new(keyframe: &Keyframe, params: &ReferenceParams) -> Self {
         let mut reference = Reference::new(params.clone());
         let mut scratch = ReferenceScratch::default();
