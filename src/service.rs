@@ -1,4 +1,4 @@
-//! Process shells: clock, threads, scheduling, configuration, health, results; one loop a process.
+//! Process shells: clock, threads, scheduling, configuration, health, results; one loop per process.
 
 pub mod adjustments;
 pub mod alignment_stamps;

@@ -1,7 +1,7 @@
-//! Keyframes are estimated jointly on a thread of its own, while frames continue: what is handed over, when it comes back
-//! into the map, and what is counted.
+//! Joint estimation of keyframes on a separate thread while frames continue: what is handed over, when a result enters
+//! the map, and what is counted.
 //!
-//! One estimate is away at a time. A keyframe that is added meanwhile waits for the next, which takes in all new ones.
+//! One estimate is in flight at a time. Keyframes added meanwhile wait for the next one, which takes in all of them.
 
 pub mod message;
 mod thread;
@@ -18,71 +18,71 @@ use crate::slam::loops::SearchReport;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::window::{Adjustment, Window};
 
-/// Live: longest wait for estimates after the last frame, twenty times what they take.
+/// Live: longest wait for estimates after the last frame, twenty times their duration.
 const LAST_ADJUSTMENTS: Duration = Duration::from_secs(5);
 
 /// When an estimate enters the map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Entry {
-    /// So many frames after it began; it is waited for. The same map in every run.
+    /// After this many frames, waiting for it if need be: the same map in every run.
     AfterFrames(u64),
     /// Between two frames as soon as it is ready. No frame waits.
     WhenReady,
 }
 
-/// What became of an estimate.
+/// The outcome of an estimate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fate {
     /// It entered the map.
     Entered,
-    /// It entered a map that had got another keyframe meanwhile, which followed.
+    /// It entered a map that had gained a keyframe meanwhile, which moved along.
     Merged,
-    /// The map had changed so much that it no longer fitted.
+    /// The map had changed too much for it to apply.
     Dropped,
 }
 
-/// An estimate that is over.
+/// A finished estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdjustmentRecord {
     /// Sequence of the last frame before it entered.
     pub sequence: u64,
-    /// Frames from its beginning until then.
+    /// Frames from its start until then.
     pub frames: u64,
-    /// CPU time that it took, nanoseconds.
+    /// CPU time it took, nanoseconds.
     pub nanos: u64,
-    /// What became of it.
+    /// Its outcome.
     pub fate: Fate,
-    /// What it came to.
+    /// Its result.
     pub adjustment: Adjustment,
 }
 
-/// A search for a place that was seen before, which is over.
+/// A finished search for a place that was seen before.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SearchRecord {
-    /// Sequence of the last frame before it was over.
+    /// Sequence of the last frame before it finished.
     pub sequence: u64,
-    /// CPU time that it took, nanoseconds.
+    /// CPU time it took, nanoseconds.
     pub nanos: u64,
-    /// What it came to.
+    /// Its result.
     pub report: SearchReport,
 }
 
-/// The estimate that is away, and the map that it was taken from.
+/// The estimate in flight, and the state of the map it was taken from.
 #[derive(Debug, Clone, Copy)]
 struct Away {
-    /// Frames that had been counted when it began.
+    /// Frames counted when it began.
     began: u64,
     epoch: u32,
     map_revision: u64,
     newest: Option<u64>,
-    /// Whether the mapper that it was taken from is gone.
+    /// Whether the mapper it was taken from has been replaced.
     is_orphan: bool,
 }
 
 /// The joint estimation of a mapper's keyframes.
 pub struct Adjustments {
     entry: Entry,
-    /// None where it is switched off, or has failed.
+    /// `None` where joint estimation is switched off or has failed.
     thread: Option<AdjustmentThread>,
     away: Option<Away>,
     /// Frames so far, and the sequence of the last.
@@ -113,40 +113,40 @@ impl Adjustments {
         })
     }
 
-    /// Readable when an estimate is ready: then [`Adjustments::pick_up`]. None where that lets nothing in, and a wait for
-    /// it would end at once again and again.
+    /// Readable when an estimate is ready: then call [`Adjustments::pick_up`]. `None` where that lets nothing in, as a
+    /// wait on it would return at once over and over.
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
         let thread = self.thread.as_ref().filter(|_| self.entry == Entry::WhenReady);
         thread.map(AdjustmentThread::descriptor)
     }
 
-    /// What is over since the last call.
+    /// Takes the estimates that finished since the last call.
     pub fn take_records(&mut self) -> impl Iterator<Item = AdjustmentRecord> {
         std::mem::take(&mut self.records).into_iter()
     }
 
-    /// Searches for loops that are over since the last call.
+    /// Takes the searches for loops that finished since the last call.
     pub fn take_searches(&mut self) -> impl Iterator<Item = SearchRecord> {
         std::mem::take(&mut self.searches).into_iter()
     }
 
-    /// Why there is no joint estimation any more; `None` where there is, and once it was asked for.
+    /// Takes the reason why joint estimation stopped; `None` while it runs, and once the reason was taken.
     pub fn take_failure(&mut self) -> Option<String> {
         self.failure.take()
     }
 
-    /// After each frame of the mapper, whose keyframe is finished: lets in what is due, hands over what is new. What
-    /// is to be published then.
+    /// After each frame of the mapper, with its keyframe finished: lets in what is due, hands over what is new. Returns
+    /// what is to be published.
     pub fn after_frame(&mut self, mapper: &mut Mapper, sequence: u64) -> StepOutcome {
         self.frames += 1;
         self.sequence = sequence;
         let before = self.let_in(mapper);
         self.begin(mapper);
-        // One that is due with its own frame.
+        // With a delay of 0 frames an estimate is due with its own frame.
         joined(before, self.let_in(mapper))
     }
 
-    /// Between two frames: lets in what is ready, where no frame needs to be waited for.
+    /// Between two frames: lets in what is ready, unless it enters at a fixed frame.
     pub fn pick_up(&mut self, mapper: &mut Mapper) -> StepOutcome {
         match self.entry {
             Entry::AfterFrames(_) => StepOutcome::default(),
@@ -158,8 +158,8 @@ impl Adjustments {
         }
     }
 
-    /// After the last frame: lets in what is away, then estimates all keyframes once more, aligns the last frames again
-    /// and refines the depth of the keyframes. It is waited for; live, where something else may have the CPU, not for long.
+    /// After the last frame: lets in the estimate in flight, estimates all keyframes once more, realigns the last
+    /// frames and refines the keyframes' depth. Waits for it; live, where other work may hold the CPU, not for long.
     pub fn finish(&mut self, mapper: &mut Mapper) -> StepOutcome {
         let is_live = self.entry == Entry::WhenReady;
         let deadline = is_live.then(|| Instant::now() + LAST_ADJUSTMENTS);
@@ -182,14 +182,14 @@ impl Adjustments {
         outcome
     }
 
-    /// The mapper is replaced by one for another camera: what is away is of no use to that.
+    /// The mapper is replaced by one for another camera: the estimate in flight is of no use to it.
     pub fn orphan(&mut self) {
         self.away.iter_mut().for_each(|away| away.is_orphan = true);
     }
 
-    /// Hands over what is new, where nothing is away.
+    /// Hands over what is new, unless an estimate is in flight.
     fn begin(&mut self, mapper: &mut Mapper) {
-        // In lockstep and replay depth is refined after the last frame, with the poses that are final then.
+        // In lockstep and replay depth is refined after the last frame, with the final poses.
         let may_refine = self.entry == Entry::WhenReady;
         self.begin_with(mapper, |mapper| mapper.begin_adjustment(may_refine));
     }
@@ -225,7 +225,7 @@ impl Adjustments {
         self.let_in_within(mapper, timeout)
     }
 
-    /// Lets in what is away, where it comes back within `timeout`.
+    /// Lets in the estimate in flight if it comes back within `timeout`.
     fn let_in_within(&mut self, mapper: &mut Mapper, timeout: Duration) -> StepOutcome {
         let (Some(away), Some(thread)) = (self.away, &self.thread) else {
             return StepOutcome::default();
@@ -259,7 +259,7 @@ impl Adjustments {
         }
     }
 
-    /// The thread has panicked: from now on keyframes are not estimated jointly.
+    /// The thread has panicked: keyframes are no longer estimated jointly.
     fn give_up(&mut self) {
         self.away = None;
         let message = self.thread.take().map(AdjustmentThread::panic_message).unwrap_or_default();
@@ -275,12 +275,12 @@ fn newest(mapper: &Mapper) -> Option<u64> {
     mapper.map().keyframes.last().map(|keyframe| keyframe.keyframe_id)
 }
 
-/// What becomes of an estimate in the map as it is now.
+/// The fate of an estimate, given the current map.
 fn fate(mapper: &Mapper, away: &Away) -> Fate {
     let is_same_map = mapper.keyframe().is_some_and(|active| {
         active.epoch == away.epoch
             && active.map_state == MapState::Established
-            // Another correction has moved what it was taken from.
+            // Otherwise another correction has moved its keyframes.
             && mapper.map().revision == away.map_revision
     });
     match (is_same_map && !away.is_orphan, newest(mapper) == away.newest) {
@@ -290,7 +290,7 @@ fn fate(mapper: &Mapper, away: &Away) -> Fate {
     }
 }
 
-/// What is to be published after both.
+/// What is to be published after both steps.
 fn joined(one: StepOutcome, other: StepOutcome) -> StepOutcome {
     StepOutcome {
         keyframe_changed: one.keyframe_changed || other.keyframe_changed,

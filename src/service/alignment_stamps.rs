@@ -1,8 +1,8 @@
-//! What the parts of an alignment cost, from the moments at which the aligner asks for its budget.
+//! Costs of the parts of an alignment, from the times at which the aligner queries its budget.
 //!
-//! It asks with the level before each iteration, which ends in one evaluation of the level's
-//! points; the first on a level pays for the evaluation that the level begins with too. What
-//! follows the last question of a frame is not counted: the covariance is in it.
+//! It queries with the level before each iteration, which ends in one evaluation of the level's points; the first
+//! iteration on a level also pays for the evaluation the level starts with. Time after the last query of a frame is not
+//! counted, the covariance included.
 
 use crate::service::clock::now_nanos;
 use crate::slam::alignment::reference::Reference;
@@ -15,14 +15,14 @@ pub struct LevelTrace {
     pub points: u32,
     /// Iterations.
     pub iterations: u32,
-    /// Evaluations whose time is known.
+    /// Evaluations that were timed.
     pub timed_evaluations: u32,
-    /// Time of these.
+    /// Their total time.
     pub timed_nanos: u64,
 }
 
 impl LevelTrace {
-    /// Nanoseconds a point and evaluation; `None` where no time is known.
+    /// Nanoseconds per point and evaluation; `None` where nothing was timed.
     pub fn nanos_per_point(&self) -> Option<f64> {
         let evaluated = u64::from(self.points) * u64::from(self.timed_evaluations);
         (evaluated > 0).then(|| self.timed_nanos as f64 / evaluated as f64)
@@ -39,17 +39,17 @@ pub struct AlignmentTrace {
     pub levels: [LevelTrace; MAX_LEVELS],
 }
 
-/// Takes a stamp at every question, in memory of its own.
+/// Takes a stamp at every query, in its own memory.
 #[derive(Debug)]
 pub struct AlignmentStamps {
     begin_nanos: i64,
-    /// Level and moment of the last question, and the evaluations that it was for.
+    /// Level and time of the last query, and the evaluations that it was for.
     last: Option<(usize, i64, u32)>,
     trace: AlignmentTrace,
 }
 
 impl AlignmentStamps {
-    /// The frame begins now.
+    /// Begins a frame now.
     pub fn begin() -> Self {
         Self { begin_nanos: now_nanos(), last: None, trace: AlignmentTrace::default() }
     }
@@ -78,7 +78,7 @@ impl AlignmentStamps {
         self.last = Some((level, now, evaluations));
     }
 
-    /// What the frame that was aligned to `reference` cost; `None` where it was not aligned.
+    /// Cost of the frame that was aligned to `reference`; `None` where it was not aligned.
     pub fn trace(mut self, reference: &Reference) -> Option<AlignmentTrace> {
         self.last?;
         for (level, trace) in self.trace.levels.iter_mut().enumerate() {

@@ -1,22 +1,22 @@
-//! Files that are whole or not there: written under a temporary name, then renamed.
+//! Files that are complete or absent: written under a temporary name, then renamed.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
-/// Lets `write` fill a new file beside `path` and renames it to `path` when all of it is written.
-/// On failure the file that stood there before stays, and the new one is removed.
+/// Lets `write` fill a new file next to `path` and renames it to `path` once it is complete. On failure the previous
+/// file stays and the new one is removed.
 pub fn write_atomically(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
 ) -> io::Result<()> {
-    /// As far as the process's mask allows.
+    /// As far as the process's umask allows.
     const EVERYBODY: u32 = 0o666;
     write_with_mode(path, EVERYBODY, write)
 }
 
-/// The same, and the file is on the disk before it has its name: a power failure does not leave an empty one.
+/// As [`write_atomically`], and synced to disk before the rename: a power failure does not leave an empty file.
 pub fn write_durably(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
@@ -28,7 +28,7 @@ pub fn write_durably(
     })
 }
 
-/// The same, and nobody but the user of the process may read the file.
+/// As [`write_atomically`], with a file that only the user of the process may read.
 pub fn write_privately(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,

@@ -1,27 +1,27 @@
-//! The time a frame has: says before each iteration whether it still fits.
+//! The time budget of a frame: decides before each iteration whether it still fits.
 
 use crate::service::clock::now_nanos;
 
-/// Levels whose cost is kept; deeper pyramids do not exist.
+/// Levels whose cost is kept; no pyramid is deeper.
 const MAX_LEVELS: usize = 16;
-/// Most that one measurement counts, in running means.
+/// Cap on one measurement, as a multiple of the running mean.
 const LARGEST_RISE: f64 = 4.0;
-/// Share of all costs that is kept when they forbid an iteration: a wrong one is forgotten within a second.
+/// Share of all costs kept when they forbid an iteration: a wrong cost is forgotten within a second.
 const KEPT_AT_REFUSAL: f64 = 0.9;
-/// What the end of a frame that is cut short takes, in iterations of the finest level: it is looked at there
-/// up to three times to choose among what there is, each time compared, and once for its covariance.
+/// Cost of ending a frame that is cut short, in iterations of the finest level: up to three evaluations there to choose
+/// among the candidates, each compared, and one for the covariance.
 const RESERVED_LOOKS: f64 = 11.0;
-/// Share of a new measurement in the running mean: a few frames follow a change of load.
+/// Weight of a new measurement in the running mean: it follows a change of load within a few frames.
 const NEW_SHARE: f64 = 0.2;
 
-/// What an iteration costs at each pyramid level, learned from the time between two questions.
+/// Cost of an iteration at each pyramid level, learned from the time between two queries.
 #[derive(Debug, Clone, Default)]
 pub struct IterationCosts {
     nanos: [f64; MAX_LEVELS],
 }
 
 impl IterationCosts {
-    /// The answer to "is there time for an iteration at this level?" until `deadline_nanos`.
+    /// Returns a closure that checks whether an iteration at a level fits before `deadline_nanos`.
     pub fn until(&mut self, deadline_nanos: i64) -> impl FnMut(usize) -> bool {
         let mut running: Option<(usize, i64)> = None;
         move |level| {
@@ -41,12 +41,12 @@ impl IterationCosts {
     fn learn(&mut self, level: usize, nanos: i64) {
         let Some(cost) = self.nanos.get_mut(level) else { return };
         let share = if *cost == 0.0 { 1.0 } else { NEW_SHARE };
-        // One iteration during which the CPU was taken away says nothing about the next.
+        // One iteration during which another thread had the CPU does not predict the next.
         let sane = if *cost == 0.0 { f64::INFINITY } else { LARGEST_RISE * *cost };
         *cost += share * ((nanos as f64).min(sane) - *cost);
     }
 
-    /// Believes less in costs that forbid an iteration: what is never tried is never measured again.
+    /// Trusts costs that forbid an iteration less: a level that is never tried is never measured again.
     fn forget(&mut self) {
         self.nanos.iter_mut().for_each(|cost| *cost *= KEPT_AT_REFUSAL);
     }
@@ -76,7 +76,7 @@ mod tests {
     }
 
     #[test]
-    fn one_iteration_that_took_long_does_not_forbid_all_that_follow() {
+    fn one_slow_iteration_does_not_forbid_all_that_follow() {
         let mut costs = IterationCosts::default();
         costs.learn(1, 50_000_000);
         let allowed = |costs: &mut IterationCosts| costs.until(now_nanos() + 16_000_000)(1);

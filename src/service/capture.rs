@@ -26,12 +26,11 @@ use crate::wire::topic::{
     CAPTURE_HEALTH, FRAME, MAPPER_HEALTH, POSE, STEP, TRACKER_HEALTH, shared_memory_bytes,
 };
 
-/// Longest sleep without a look at signals and health.
+/// Longest sleep between two checks of signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
-/// Longest wait for the last pose of a tracker that runs already: it serves late subscribers ten times a
-/// second.
+/// Longest wait for the last pose of a tracker that already runs: it serves late subscribers ten times a second.
 const LAST_POSE_NANOS: i64 = 250_000_000;
-/// Pause between two looks for it.
+/// Pause between two checks for it.
 const LAST_POSE_PAUSE: Duration = Duration::from_millis(10);
 
 /// What to capture and how.
@@ -45,7 +44,7 @@ pub struct CaptureOptions {
     pub mode: Mode,
 }
 
-/// Runs the process to the end of the source or to the signal.
+/// Runs the process until the source ends or a signal arrives.
 pub fn run(config: &Config, options: &CaptureOptions, shutdown: &Shutdown) -> Result<(), RunError> {
     let mut shell = Shell::prepare(config, options, shutdown)?;
     let outcome = shell.prepare_source().and_then(|()| {
@@ -56,7 +55,7 @@ pub fn run(config: &Config, options: &CaptureOptions, shutdown: &Shutdown) -> Re
         shell.health.tell_ready();
         shell.stream()
     });
-    // A supervisor that did not ask for the end starts another, which continues from here.
+    // A supervisor that did not request the end starts another capture, which continues from here.
     let is_asked = matches!(outcome, Err(RunError::Interrupted)) && !is_supervised();
     if outcome.is_ok() || is_asked {
         shell.position.end_in_order();
@@ -66,13 +65,13 @@ pub fn run(config: &Config, options: &CaptureOptions, shutdown: &Shutdown) -> Re
     outcome
 }
 
-/// What became of the next frame.
+/// Result of sending the next frame.
 enum Sent {
     /// It was sent, with this sequence.
     Frame(u64),
-    /// It was damaged.
+    /// The frame was damaged.
     Nothing,
-    /// There is none.
+    /// No frame is left.
     End,
 }
 
@@ -84,25 +83,25 @@ struct Shell<'a> {
     intrinsics: Intrinsics,
     frames: Publisher<u8, FrameHeader>,
     steps: Subscriber<StepMessage, ()>,
-    /// Live: the place in the source, for a successor; without the file capture works too.
+    /// Live: the position in the source, for a successor; capture works without the file too.
     position: PositionKeeper,
-    /// Where a capture of the same run has died.
+    /// Where a capture of the same run died.
     left: Option<Position>,
-    /// Until the first frame, where nothing is known of a capture before: what a tracker says that runs already.
+    /// Until the first frame, where no earlier capture is on record: the poses of a tracker that already runs.
     poses: Option<Subscriber<PoseMessage, ()>>,
     peers: [Peer; 2],
     health: Health,
     pace: Option<Pace>,
-    /// Why there is no camera, while there is none.
+    /// Why the camera is absent, while it is.
     absence: Option<String>,
     /// Images of a recording that could not be used.
     refused: RefusedImages,
-    /// What a camera's numbers begin with.
+    /// First sequence of a camera's frames.
     first_sequence: u64,
-    /// What is no newer than the last frame of the capture before is not sent.
+    /// Frames no newer than the last one of the previous capture are not sent.
     predecessor: Predecessor,
     next_sequence: Option<u64>,
-    /// Gaps between the last frame of the capture before and the first of this one.
+    /// Gaps between the last frame of the previous capture and the first of this one.
     gaps_before: u64,
     _claim: Claim,
 }
@@ -132,7 +131,7 @@ impl<'a> Shell<'a> {
         let hub = Hub::join(&place, "capture", Access::Member)?;
         let (source_name, path) = (options.source.to_string(), place.position_path());
         let (position, left) = PositionKeeper::of_run(&path, options.mode, &source_name, rig);
-        // A supervisor knows whether there was a capture before; without one the tracker is asked too.
+        // A supervisor keeps track of earlier captures; without one the tracker is queried too.
         let asks_tracker = options.mode == Mode::Live && left.is_none() && !is_supervised();
         let mut health = Health::open(&hub, &CAPTURE_HEALTH)?;
         health.tell_source(&options.source.to_string());
@@ -163,12 +162,12 @@ impl<'a> Shell<'a> {
         Ok(shell)
     }
 
-    /// Whether frames come from a recording, which can wait for its readers.
+    /// Whether frames come from a recording, which can wait for its subscribers.
     fn is_recorded(&self) -> bool {
         self.source.num_frames().is_some()
     }
 
-    /// Everything that must be over before the first frame: rendering, and tracker and mapper.
+    /// Does everything that must finish before the first frame: rendering, and waiting for tracker and mapper.
     fn prepare_source(&mut self) -> Result<(), RunError> {
         self.health.enter(ProcessState::Preparing, "");
         if let Some(file) = prepared_frames()
@@ -204,8 +203,8 @@ impl<'a> Shell<'a> {
         }
     }
 
-    /// Where another capture has died: a recording continues behind its last frame, and a camera's
-    /// numbers behind its last number. Neither sequences nor stamps go back.
+    /// Continues after another capture that died: a recording after its last frame, a camera's numbers after its last
+    /// number. Neither sequences nor stamps go back.
     fn go_on_after_another(&mut self) -> Result<(), RunError> {
         if let Some(left) = self.left {
             self.predecessor.last_nanos = Some(left.capture_nanos);
@@ -228,13 +227,13 @@ impl<'a> Shell<'a> {
             self.source.skip_to(sequence)?;
         } else {
             self.first_sequence = sequence.saturating_add(1);
-            // What the camera saw while nobody looked is a hole, of a length that nobody knows.
+            // What the camera saw in between is a gap of unknown length.
             self.gaps_before = 1;
         }
         Ok(())
     }
 
-    /// Frame after frame.
+    /// Sends frame after frame.
     fn stream(&mut self) -> Result<(), RunError> {
         loop {
             if self.await_frame()? {
@@ -251,7 +250,7 @@ impl<'a> Shell<'a> {
         }
     }
 
-    /// Waits for the next frame, for a moment; whether there is one. An absent camera is a state.
+    /// Waits briefly for the next frame; returns whether it has arrived. An absent camera is a state.
     fn await_frame(&mut self) -> Result<bool, RunError> {
         let millis = WAKE_PERIOD.as_millis() as u32;
         let arrival = self.source.await_frame(self.shutdown.descriptor(), millis)?;
@@ -278,7 +277,7 @@ impl<'a> Shell<'a> {
             Arrival::Absent(reason) => {
                 self.health.enter(ProcessState::Stale, &reason);
                 if self.absence.as_ref() != Some(&reason) {
-                    // A supervisor shows it itself.
+                    // A supervisor prints it itself.
                     if !is_supervised() {
                         tracing::warn!("capture: {reason}");
                     }
@@ -289,7 +288,7 @@ impl<'a> Shell<'a> {
         Ok(false)
     }
 
-    /// What a camera has lost, into the health.
+    /// Copies a camera's losses into the health.
     fn count_losses(&mut self) {
         if let Some(losses) = self.source.losses() {
             let counters = self.health.counters();
@@ -299,7 +298,7 @@ impl<'a> Shell<'a> {
         }
     }
 
-    /// Reads the next frame into shared memory and sends it when it is due.
+    /// Reads the next frame into shared memory and sends it when due.
     fn send_next(&mut self) -> Result<Sent, RunError> {
         let _span = tracing::trace_span!("frame").entered();
         let mut loan = self.frames.loan(self.intrinsics.width * self.intrinsics.height)?;
@@ -339,24 +338,24 @@ impl<'a> Shell<'a> {
         };
         let _span = tracing::trace_span!("publish", sequence = stamp.sequence).entered();
         count(self.health.counters(), &mut self.next_sequence, &stamp);
-        // Before it is sent: a frame that is lost between the two is better than one that is sent twice.
+        // Before sending: a frame lost between the two is better than one sent twice.
         let counters = self.health.counters();
         self.position.note_or_warn(&Position::at(&stamp, counters.frames, counters.gaps));
         let header = self.header(&stamp, clock_nanos);
         if self.mode == Mode::Live {
-            // A deadline counts from the arrival: what is late before that is told here.
+            // A deadline counts from the arrival: lateness before that is recorded here.
             self.health.count_latency(header.sent_nanos.saturating_sub(clock_nanos).max(0) as u64);
         }
         loan.send(header)?;
         Ok(Sent::Frame(stamp.sequence))
     }
 
-    /// Whether a frame that cannot be used ends the run; a camera's never does.
+    /// Whether an unusable frame ends the run; a camera's never does.
     fn ends_at(&self, error: &SourceError) -> bool {
         self.config.capture.strict && matches!(error, SourceError::Image(_))
     }
 
-    /// A frame is left out: a camera counts its own, those of a recording are named too.
+    /// Leaves a frame out: a camera counts its own, those of a recording are also named.
     fn refuse(&mut self, error: &SourceError) {
         if !self.is_recorded() {
             tracing::debug!("{error}");
@@ -364,7 +363,7 @@ impl<'a> Shell<'a> {
         }
         self.refused.refuse(error);
         self.health.counters().refused = self.refused.count();
-        // Its place in the sequence stays empty, which is no gap: it is counted here.
+        // Its place in the sequence stays empty, which is not a gap: the next expected number skips it.
         self.next_sequence = self.next_sequence.map(|next| next.saturating_add(1));
     }
 

@@ -1,5 +1,5 @@
-//! The mapper's checkpoint: what it needs to continue after its death, in the runtime folder. Written by a
-//! thread of its own, so that no frame waits for a file.
+//! The mapper's checkpoint in the runtime folder: the state it needs to continue after its death. Written by a separate
+//! thread, so that no frame waits for a file.
 
 use std::fs;
 use std::io;
@@ -17,24 +17,24 @@ use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 use crate::slam::mapper::{Mapper, StepOutcome};
 
-/// Keyframes that a successor gets with image and depth, beside the active one: a window's.
+/// Keyframes kept with image and depth for a successor, besides the active one: as many as a window holds.
 const KEPT_KEYFRAMES: usize = 20;
-/// Keyframes that wait to be written; a disk that is slower than that loses the oldest of them.
+/// Keyframes that wait to be written; a slower disk loses the oldest of them.
 const WAITING_KEYFRAMES: usize = 4;
-/// Time between two checkpoints of a keyframe whose depth improves; a new keyframe has one at once.
+/// Time between two checkpoints of a keyframe whose depth improves; a new keyframe gets one at once.
 const PERIOD_NANOS: i64 = 1_000_000_000;
 
-/// The checkpoint of a mapper, and what it writes before it gives its first number.
+/// The checkpoint of a mapper, and the reservation it writes before it assigns its first number.
 #[derive(Debug)]
 pub struct Kept {
     checkpoint: Checkpoint,
     reservation: Option<Map>,
-    /// CLOCK_MONOTONIC when the last was handed over.
+    /// CLOCK_MONOTONIC of the last hand-over.
     handed_nanos: i64,
 }
 
 impl Kept {
-    /// What a dead mapper has left at `path`, and the keeper of our own. Without either the mapper works too.
+    /// Reads what a dead mapper left at `path` and opens the checkpoint of this one. The mapper works without either.
     pub fn open(path: &Path) -> (Option<Self>, Option<Map>) {
         let left = read_checkpoint(path).unwrap_or_else(|error| {
             tracing::warn!("starting a new map: {error}");
@@ -54,15 +54,15 @@ impl Kept {
         }
     }
 
-    /// From now on numbers are given: who comes after gives others.
+    /// Numbers are assigned from now on: a successor will assign others.
     pub fn reserve(&mut self) {
         if let Some(map) = self.reservation.take() {
             self.checkpoint.put_now(&map);
         }
     }
 
-    /// Hands over what a step or a correction has changed: the keyframe that was left, and the state where another
-    /// keyframe is active, the map was corrected, or the last was handed over some time ago.
+    /// Hands over what a step or a correction changed: the keyframe that was left, and the state where another keyframe
+    /// is active, the map was corrected, or the last hand-over is some time ago.
     pub fn follow(&mut self, mapper: &mut Mapper, outcome: &StepOutcome) {
         let is_corrected = outcome.graph_changed && !outcome.needs_image();
         let is_new = outcome.needs_image() || is_corrected;
@@ -71,8 +71,8 @@ impl Kept {
             self.checkpoint.put_keyframe(keyframe.clone());
             is_left = true;
         }
-        // The depth of the one before the active is what a correction changes most; the others are in their files
-        // as they were when they were left or refined, and a successor estimates them again.
+        // A correction changes the depth of the keyframe before the active one most; the others stay in their files as
+        // they were when they were left or refined, and a successor estimates them again.
         let before = is_corrected.then(|| before_active(mapper)).flatten();
         if let Some(keyframe) = before.filter(|_| !is_left).and_then(|id| mapper.map().get(id)) {
             self.checkpoint.put_keyframe(keyframe.clone());
@@ -87,21 +87,20 @@ impl Kept {
         }
     }
 
-    /// Nobody needs to continue from here: the files are removed with this.
+    /// No process needs to continue from here: the files are removed on drop.
     pub fn end_in_order(&mut self) {
         self.checkpoint.is_over = true;
     }
 }
 
-/// The newest keyframe with depth beside the active one.
+/// The newest keyframe with depth other than the active one.
 fn before_active(mapper: &Mapper) -> Option<u64> {
     let active = mapper.keyframe()?.keyframe_id;
     let mut others = mapper.map().keyframes.iter().rev().filter(|of| of.keyframe_id != active);
     others.find(|keyframe| keyframe.has_depth()).map(|keyframe| keyframe.keyframe_id)
 }
 
-/// Writes the newest checkpoint, and the keyframes before it once each. The files stay unless the process ends
-/// in order.
+/// Writes the newest checkpoint, and each keyframe before it once. The files stay unless the process ends in order.
 #[derive(Debug)]
 struct Checkpoint {
     path: PathBuf,
@@ -118,7 +117,7 @@ struct Shared {
 }
 
 impl Checkpoint {
-    /// Keeps the checkpoint in the file `path`; what a mapper before has left there stays until the first.
+    /// Keeps the checkpoint in the file `path`; a previous mapper's checkpoint stays until the first write.
     fn keep(path: &Path) -> io::Result<Self> {
         remove_unfinished(path);
         let shared = Arc::new(Shared {
@@ -133,19 +132,19 @@ impl Checkpoint {
         Ok(Self { path: path.to_owned(), shared, thread: Some(thread), is_over: false })
     }
 
-    /// Writes a state before it returns, unless the disk refuses, which is said in the log; the next one may
-    /// fit. Before the first [`Checkpoint::put`].
+    /// Writes a state before it returns; a disk error is logged, as the next state may fit. Call before the first
+    /// [`Checkpoint::put`].
     fn put_now(&self, map: &Map) {
         write_or_warn(&self.path, map);
     }
 
-    /// Hands over the newest state; one that was not written yet is older and goes.
+    /// Hands over the newest state and drops an older one that was not written yet.
     fn put(&self, map: Map) {
         drop(self.shared.newest.force_push(map));
         self.wake();
     }
 
-    /// Hands over a keyframe that is not active any more.
+    /// Hands over a keyframe that is no longer active.
     fn put_keyframe(&self, keyframe: Keyframe) {
         drop(self.shared.left.force_push(keyframe));
         self.wake();
@@ -173,7 +172,7 @@ impl Drop for Checkpoint {
     }
 }
 
-/// It holds images: for the user of the process alone.
+/// The file holds images: readable only by the user of the process.
 fn write_or_warn(path: &Path, map: &Map) {
     if let Err(error) = write_privately(path, |file| write_map_into(file, map)) {
         tracing::warn!(
@@ -185,7 +184,7 @@ fn write_or_warn(path: &Path, map: &Map) {
 
 fn write_until_stopped(path: &Path, shared: &Shared) {
     while !shared.stop.load(Ordering::Acquire) {
-        // A keyframe first: the state that comes after it lists it.
+        // Keyframes first: the state that follows lists them.
         if let Some(keyframe) = shared.left.pop() {
             write_keyframe(path, keyframe);
         } else if let Some(map) = shared.newest.pop() {
@@ -196,7 +195,7 @@ fn write_until_stopped(path: &Path, shared: &Shared) {
     }
 }
 
-/// A checkpoint as it was in its file: the keyframes before the active one have files of their own.
+/// A checkpoint as it was in its file: the keyframes before the active one have separate files.
 fn as_written(read: &Map) -> Map {
     let is_active = |keyframe: &Keyframe| Some(keyframe.keyframe_id) == read.active;
     let written = |keyframe: &Keyframe| match is_active(keyframe) {
@@ -212,7 +211,7 @@ fn as_written(read: &Map) -> Map {
     }
 }
 
-/// Writes a keyframe into a file of its own; of more than are kept the oldest go.
+/// Writes a keyframe into a separate file and removes the oldest beyond [`KEPT_KEYFRAMES`].
 fn write_keyframe(path: &Path, keyframe: Keyframe) {
     let file = keyframe_file(path, keyframe.keyframe_id);
     write_or_warn(&file, &Map { keyframes: vec![keyframe], ..Map::default() });
@@ -221,14 +220,14 @@ fn write_keyframe(path: &Path, keyframe: Keyframe) {
     files.into_iter().take(surplus).for_each(|(_, file)| drop(fs::remove_file(file)));
 }
 
-/// Where a keyframe before the active one is kept.
+/// File of a keyframe before the active one.
 fn keyframe_file(path: &Path, keyframe_id: u64) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(format!(".{keyframe_id}"));
     PathBuf::from(name)
 }
 
-/// Those that there are, the oldest first.
+/// Existing keyframe files, oldest first.
 fn keyframe_files(path: &Path) -> Vec<(u64, PathBuf)> {
     let (Some(folder), Some(name)) = (path.parent(), path.file_name()) else { return Vec::new() };
     let beginning = format!("{}.", name.to_string_lossy());
@@ -243,21 +242,21 @@ fn keyframe_files(path: &Path) -> Vec<(u64, PathBuf)> {
     files
 }
 
-/// Removes what mappers that were killed while they wrote have left.
+/// Removes files of mappers that were killed while writing.
 fn remove_unfinished(path: &Path) {
     let (Some(folder), Some(name)) = (path.parent(), path.file_name()) else { return };
     let beginning = format!(".{}.", name.to_string_lossy());
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
         let name = entry.file_name().to_string_lossy().into_owned();
         if name.starts_with(&beginning) && name.ends_with(".tmp") {
-            // What cannot be removed is removed by the next.
+            // What cannot be removed is left to the next mapper.
             drop(fs::remove_file(entry.path()));
         }
     }
 }
 
-/// The checkpoint that a killed mapper left at `path`, with image and depth of the keyframes before the active one
-/// as far as they can be read; `None` where there is none.
+/// Reads the checkpoint that a killed mapper left at `path`, with image and depth of the keyframes before the active
+/// one as far as they are readable; `None` where no checkpoint exists.
 pub fn read_checkpoint(path: &Path) -> Result<Option<Map>, MapFileError> {
     if !path.exists() {
         return Ok(None);
@@ -265,7 +264,7 @@ pub fn read_checkpoint(path: &Path) -> Result<Option<Map>, MapFileError> {
     let mut map = read_map(path)?;
     let without_depth = map.keyframes.iter_mut().rev().filter(|keyframe| !keyframe.has_depth());
     for keyframe in without_depth.take(KEPT_KEYFRAMES) {
-        // One that was never written, or is torn, is missed by nobody who has lived without it.
+        // A keyframe whose file was never written or is torn stays without depth.
         let Ok(kept) = read_map(&keyframe_file(path, keyframe.keyframe_id)) else { continue };
         let of_same = |kept: &Keyframe| {
             (kept.keyframe_id, kept.epoch, kept.intrinsics)
@@ -273,7 +272,7 @@ pub fn read_checkpoint(path: &Path) -> Result<Option<Map>, MapFileError> {
         };
         if let Some(kept) = kept.keyframes.into_iter().next().filter(of_same) {
             (keyframe.image, keyframe.points) = (kept.image, kept.points);
-            // Of the points that are taken: the state may be older than they are, or newer.
+            // The flag belongs to the points taken: the state may be older or newer than they are.
             keyframe.is_refined = kept.is_refined;
         }
     }
@@ -299,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn a_checkpoint_is_there_until_its_keeper_ends_in_order() {
+    fn a_checkpoint_exists_until_its_keeper_ends_in_order() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rig.checkpoint");
         assert!(read_checkpoint(&path).unwrap().is_none());
@@ -376,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn a_broken_checkpoint_is_an_error() {
+    fn a_corrupt_checkpoint_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rig.checkpoint");
         fs::write(&path, "semidense").unwrap();

@@ -1,4 +1,4 @@
-//! A process that the supervisor has started: it ends with the supervisor, whatever happens.
+//! A process that the supervisor started: it ends with the supervisor, whatever happens.
 
 use std::ffi::OsString;
 use std::fs::File;
@@ -24,16 +24,16 @@ use crate::service::position::RUN_VARIABLE;
 use crate::wire::folders::ROOT_VARIABLE;
 use crate::wire::place::Place;
 
-/// Environment variable with the process id of the supervisor.
+/// Environment variable that holds the process id of the supervisor.
 pub const SUPERVISOR_VARIABLE: &str = "SEMIDENSE_SUPERVISOR";
-/// Environment variable that says where frames that are prepared outlive their process.
+/// Environment variable that tells where prepared frames outlive their process.
 const FRAMES_VARIABLE: &str = "SEMIDENSE_PREPARED_FRAMES";
 const FRAMES_ON_STDIN: &str = "stdin";
-/// What the last line of a command that fails begins with.
+/// Prefix of the last line of a command that fails.
 pub const ERROR_PREFIX: &str = "error: ";
-/// How long a killed process may take to end: one that the kernel does not let go, as in a driver that hangs, is left.
+/// Longest wait for a killed process to end: one that the kernel does not release, as in a hanging driver, is left.
 const LONGEST_DEATH: Duration = Duration::from_secs(2);
-/// How long after a process's end its last words are waited for: somebody else may hold its standard error.
+/// Longest wait after a process's end for its last lines: another process may hold its standard error.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 
 /// Why a supervised process must not start.
@@ -42,18 +42,18 @@ pub enum FollowError {
     /// The supervisor has died before this process could follow it.
     #[error("the supervisor is gone")]
     Gone,
-    /// The kernel refuses.
+    /// The kernel refuses the request.
     #[error("cannot watch whether the supervisor lives ({0})")]
     Kernel(io::Error),
 }
 
-/// Whether a supervisor has started this process.
+/// Whether a supervisor started this process.
 pub fn is_supervised() -> bool {
     std::env::var_os(SUPERVISOR_VARIABLE).is_some()
 }
 
-/// Where a supervisor has frames kept that are prepared before the first one is due: its own memory, so that a
-/// capture that is killed leaves them to the next.
+/// Where the supervisor keeps frames that are prepared before the first one is due: in its own memory, so that a killed
+/// capture leaves them to the next.
 pub fn prepared_frames() -> Option<File> {
     let place = std::env::var(FRAMES_VARIABLE).ok()?;
     (place == FRAMES_ON_STDIN).then_some(())?;
@@ -73,8 +73,8 @@ pub fn memory_for_frames(source: &SourceName, mode: Mode) -> Option<File> {
     said.ok().map(File::from)
 }
 
-/// In a process that a supervisor has started: be told to stop when it dies. Does nothing in one
-/// that was started by hand.
+/// In a process that a supervisor started: requests a signal to stop when the supervisor dies. Does nothing in a
+/// process started by hand.
 pub fn follow_supervisor() -> Result<(), FollowError> {
     let Some(supervisor) = std::env::var(SUPERVISOR_VARIABLE).ok().and_then(|pid| pid.parse().ok())
     else {
@@ -86,11 +86,11 @@ pub fn follow_supervisor() -> Result<(), FollowError> {
     if parent == Some(supervisor) { Ok(()) } else { Err(FollowError::Gone) }
 }
 
-/// What a process does last: removes what is left where nobody else is there, of this instance and, where its
-/// supervisor was killed, of that. A killed process holds its locks for some time after its children have heard of
-/// its death, and until then it cannot be told from a living one.
+/// Last step of a process: removes what this instance left and no other process holds, including what its supervisor
+/// left if that was killed. A killed process holds its locks for some time after its children have learnt of its death,
+/// and until then it cannot be told from a living one.
 pub fn tidy_up(place: &Place) {
-    /// Longest time that a killed process takes to be gone, on a busy machine with a slow disk.
+    /// Longest time until a killed process is gone, on a busy machine with a slow disk.
     const LONGEST_DEATH: Duration = Duration::from_secs(10);
     let supervisor = std::env::var(SUPERVISOR_VARIABLE).ok().and_then(|pid| pid.parse().ok());
     if let Some(supervisor) = supervisor {
@@ -111,8 +111,8 @@ pub struct Child {
 }
 
 impl Child {
-    /// Starts the subcommand `name` of this binary. `run` names the run that it belongs to; `frames`
-    /// is where it keeps frames that it prepares; its log goes to `log`.
+    /// Starts the subcommand `name` of this binary. `run` names the run it belongs to; `frames` holds the frames that
+    /// it prepares; its log goes to `log`.
     pub fn start(
         name: &'static str,
         arguments: &[OsString],
@@ -147,7 +147,7 @@ impl Child {
         self.process.id()
     }
 
-    /// How long ago it was started.
+    /// Time since its start.
     pub fn age(&self) -> Duration {
         self.started.elapsed()
     }
@@ -157,26 +157,26 @@ impl Child {
         self.process.try_wait()
     }
 
-    /// Whether a signal or a debugger keeps it from running.
+    /// Whether a signal or a debugger has stopped it.
     pub fn is_stopped(&self) -> bool {
         Liveness::of(self.id()) == Liveness::Stopped
     }
 
     /// Asks it to stop (SIGTERM).
     pub fn ask_to_stop(&mut self) {
-        // A process that has been waited for has no id any more that could be meant.
+        // The id of a process that has been waited for may belong to another process.
         if let Ok(None) = self.process.try_wait() {
             let _ = rustix::process::kill_process(Pid::from_child(&self.process), Signal::TERM);
         }
     }
 
-    /// Kills it and waits for its end, but not forever.
+    /// Kills it and waits a bounded time for its end.
     pub fn kill(&mut self) {
         let _ = self.process.kill();
         wait_at_most(LONGEST_DEATH, || !matches!(self.process.try_wait(), Ok(None)));
     }
 
-    /// What it said when it failed. Call it after its end.
+    /// Its error message, where it failed. Call after its end.
     pub fn fault(&mut self) -> Option<String> {
         if let Some(reader) = self.reader.take() {
             wait_at_most(LAST_WORDS, || reader.is_finished());
@@ -195,11 +195,11 @@ fn locked(fault: &Mutex<Option<String>>) -> MutexGuard<'_, Option<String>> {
     fault.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// What starts a process for the instance in the folder `root`: in a process group of its own, so that a Ctrl-C at the
-/// terminal reaches only this process.
+/// The command that starts a process for the instance in the folder `root`, in a separate process group, so that a
+/// Ctrl-C at the terminal reaches only this process.
 pub fn command(program: &Path, root: &Path) -> Command {
     let mut command = Command::new(program);
-    // The service manager knows this process, not its children.
+    // The service manager watches this process, not its children.
     for variable in VARIABLES {
         command.env_remove(variable);
     }
@@ -213,7 +213,7 @@ pub fn command(program: &Path, root: &Path) -> Command {
     command
 }
 
-/// Hands on every line that comes, from a thread of its own.
+/// Passes on every line from a separate thread.
 pub fn forward_lines(
     name: &str,
     from: impl Read + Send + 'static,

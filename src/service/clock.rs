@@ -4,19 +4,19 @@ use std::time::{Duration, Instant};
 
 use rustix::time::{ClockId, clock_gettime};
 
-/// Nanoseconds of CLOCK_MONOTONIC, the one clock of all our messages.
+/// CLOCK_MONOTONIC in nanoseconds, the one clock of all messages.
 pub fn now_nanos() -> i64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec * 1_000_000_000 + now.tv_nsec
 }
 
-/// Nanoseconds since 1970 (CLOCK_REALTIME) at the instant `clock_nanos` of CLOCK_MONOTONIC, by what both clocks show now. It
-/// never blocks, and is as exact as the two are read together: a microsecond but where the thread is interrupted between
-/// them, and then again.
+/// Nanoseconds since 1970 (CLOCK_REALTIME) at the instant `clock_nanos` of CLOCK_MONOTONIC, from the current offset of
+/// the clocks. Never blocks. As exact as the two clocks are read together: to a microsecond, unless the thread is
+/// interrupted between them at every attempt.
 pub fn realtime_of(clock_nanos: i64) -> i64 {
-    /// Between the two readings of one clock around the other's, nanoseconds: several times what three take.
+    /// Accepted time between the two readings around the other clock's, nanoseconds: several times what three take.
     const READ_TOGETHER: i64 = 2_000;
-    /// How often that is tried.
+    /// Attempts to stay within it.
     const ATTEMPTS: usize = 4;
     let read = || {
         let before = now_nanos();
@@ -35,14 +35,14 @@ pub fn realtime_of(clock_nanos: i64) -> i64 {
     clock_nanos.saturating_add(best.1)
 }
 
-/// `nanos` as a duration, nothing where it is negative.
+/// `nanos` as a duration, zero where negative.
 pub fn duration_from_nanos(nanos: i64) -> Duration {
     Duration::from_nanos(u64::try_from(nanos).unwrap_or(0))
 }
 
-/// Looks again and again whether something is over, at most for `longest`; whether it is.
+/// Polls `is_over` until it holds or `longest` has passed; returns whether it holds.
 pub fn wait_at_most(longest: Duration, mut is_over: impl FnMut() -> bool) -> bool {
-    /// Between two looks.
+    /// Pause between two polls.
     const PAUSE: Duration = Duration::from_millis(2);
     let start = Instant::now();
     while !is_over() {
@@ -54,7 +54,7 @@ pub fn wait_at_most(longest: Duration, mut is_over: impl FnMut() -> bool) -> boo
     true
 }
 
-/// Says when a recorded frame is due: as long after the first as its stamp says.
+/// When recorded frames are due: as long after the first as their stamps are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pace {
     first_stamp_nanos: i64,
@@ -79,7 +79,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_are_due_as_their_stamps_say() {
+    fn frames_are_due_according_to_their_stamps() {
         let pace = Pace::start(5_000, 1_000_000);
         assert_eq!(pace.due_nanos(5_000), 1_000_000);
         assert_eq!(pace.due_nanos(38_000), 1_033_000);

@@ -1,8 +1,8 @@
-//! The configuration: every parameter struct under one roof, read once, checked once.
+//! The configuration: every parameter struct in one place, read once, checked once.
 //!
-//! Precedence: built-in < `semidense.toml` < `--set key=value`; a rig file is the camera's alone.
-//! Unknown keys are refused; an error names the place, the key, the value and what is allowed. A file has two
-//! parts, see `layout`: what a user may want to set, and `[expert]`.
+//! Precedence: built-in < `semidense.toml` < `--set key=value`; a rig file holds only the camera. Unknown keys are
+//! refused; an error names the place, the key, the value and what is allowed. A file has two parts, see `layout`: keys
+//! that a user may want to set, and `[expert]`.
 
 mod layout;
 mod origins;
@@ -30,16 +30,16 @@ use crate::slam::tracker::TrackerParams;
 
 /// Folder of the files that are read when no other is named: `<instance>.toml`, else `semidense.toml`.
 pub const SYSTEM_FOLDER: &str = "/etc/semidense";
-/// Largest configuration file; the one with every key has 30 kB.
+/// Largest configuration file, bytes; one with every key has 30 kB.
 const MAX_FILE_BYTES: u64 = 1 << 20;
-/// Read for every instance that has no file of its own.
+/// Read for every instance without its own file.
 const COMMON_FILE: &str = "semidense.toml";
 
-/// Everything that can be set. In a file most of it stands below `[expert]`, see `layout`.
+/// All settings. In a file most of them are below `[expert]`, see `layout`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// First part of every topic's name: two instances run side by side.
+    /// First part of every topic's name, so that two instances can run side by side.
     pub instance: String,
     /// Folder of sockets and locks; empty for the usual one (`SEMIDENSE_ROOT`, systemd's
     /// `RUNTIME_DIRECTORY`, `/run/semidense` for the user of the services, `$XDG_RUNTIME_DIR/semidense`, or one
@@ -51,17 +51,17 @@ pub struct Config {
     pub tracker: TrackerConfig,
     /// The mapper process.
     pub mapper: MapperConfig,
-    /// Who starts and watches the three.
+    /// Starting and watching the three processes.
     pub supervisor: SupervisorConfig,
-    /// The noise of the camera's images, for tracking and mapping alike.
+    /// Noise of the camera's images, for tracking and mapping alike.
     pub noise: ImageNoise,
     /// The map on disk.
     pub map: MapConfig,
-    /// How tracking computes.
+    /// Parameters of tracking.
     pub tracking: TrackerParams,
-    /// How mapping computes.
+    /// Parameters of mapping.
     pub mapping: MapperParams,
-    /// What the files of a run contain.
+    /// Contents of a run's files.
     pub results: ResultsParams,
     /// The simulated camera and its world.
     pub simulator: SimulatorParams,
@@ -71,23 +71,23 @@ pub struct Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CaptureConfig {
-    /// Where frames come from when the command line does not say: a folder whose layout is recognised, `sim`,
-    /// `sim:SCENE`, `tum:DIR`, `euroc:DIR`, `images:DIR`, `mcap:FILE[:TOPIC]`, `v4l:DEVICE`, `ros2:TOPIC`, `stream:SOCKET`
-    /// or `loop:FRAMES:HZ:SOURCE`.
+    /// Source of the frames when the command line names none: a folder whose layout is recognised, `sim`, `sim:SCENE`,
+    /// `tum:DIR`, `euroc:DIR`, `images:DIR`, `mcap:FILE[:TOPIC]`, `v4l:DEVICE`, `ros2:TOPIC`, `stream:SOCKET` or
+    /// `loop:FRAMES:HZ:SOURCE`.
     pub source: String,
-    /// The camera's rig file when `--rig` does not say; empty for none. In a configuration file a path is
-    /// relative to that file.
+    /// The camera's rig file unless `--rig` names one; empty for none. In a configuration file a path is relative to
+    /// that file.
     pub rig: String,
-    /// Whether an image of a recording that is damaged or missing ends the run with an error, as `--strict`
-    /// does; otherwise it is left out and counted.
+    /// Whether a damaged or missing image of a recording ends the run with an error, as `--strict` does; otherwise it
+    /// is left out and counted.
     pub strict: bool,
     /// Longest wait for tracker and mapper to get ready before a recording starts, seconds.
     pub connect_timeout_s: f64,
-    /// Lockstep: longest wait for the map to take in a frame, seconds.
+    /// Lockstep: longest wait for a frame to enter the map, seconds.
     pub step_timeout_s: f64,
-    /// What it asks of the kernel. On a robot: fifo, above the tracker's priority.
+    /// Scheduling it requests from the kernel. On a robot: fifo, above the tracker's priority.
     pub scheduling: SchedulingParams,
-    /// What it asks of a camera (source `v4l:DEVICE`).
+    /// Settings it requests from a camera (source `v4l:DEVICE`).
     pub camera: CameraParams,
 }
 
@@ -112,13 +112,13 @@ pub struct TrackerConfig {
     /// Live: time from a frame's arrival to its pose, milliseconds; 0 is half the time between two
     /// frames. At the deadline the best pose so far is published as degraded (budget).
     pub deadline_ms: f64,
-    /// Live: so long before a frame is expected the frame loop is awake, and looks for it until as long
-    /// after, microseconds; 0 sleeps until it comes. A CPU that sleeps takes about 100 to wake; 300
-    /// costs 2 % of a CPU at 30 Hz. For cameras with an even period.
+    /// Live: the frame loop wakes this long before a frame is expected and polls for it until as long after,
+    /// microseconds; 0 sleeps until it arrives. A sleeping CPU takes about 100 to wake; 300 costs 2 % of a CPU at 30
+    /// Hz. For cameras with an even period.
     pub early_wake_us: f64,
-    /// Live: after so many frame periods without a frame tracker and mapper are stale.
+    /// Live: frame periods without a frame after which tracker and mapper are stale.
     pub stale_periods: f64,
-    /// What its frame loop asks of the kernel. On a robot: fifo, and locked memory.
+    /// Scheduling its frame loop requests from the kernel. On a robot: fifo, and locked memory.
     pub scheduling: SchedulingParams,
 }
 
@@ -133,13 +133,13 @@ impl Default for TrackerConfig {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MapperConfig {
-    /// Threads of its pool; 0 is one for each CPU. The map does not depend on it.
+    /// Threads of its pool; 0 is one per CPU. The map does not depend on it.
     pub threads: usize,
-    /// Live: when its thread runs that estimates keyframes jointly, which no frame waits for: `idle`, when a CPU has
-    /// nothing else to do, or `other`, as its other threads, where idle leaves it no time.
+    /// Live: scheduling of the thread that estimates keyframes jointly, which no frame waits for: `idle`, when a CPU
+    /// has nothing else to do, or `other`, like its other threads, where idle leaves it no time.
     pub background: Background,
-    /// What it asks of the kernel, for all its threads. It has no deadline: leave it on other CPUs than
-    /// the tracker where there are enough.
+    /// Scheduling it requests from the kernel for all its threads. It has no deadline: where there are enough CPUs,
+    /// keep it off the tracker's.
     pub scheduling: SchedulingParams,
 }
 
@@ -147,25 +147,25 @@ pub struct MapperConfig {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MapConfig {
-    /// Folder of a map that a run begins or continues when `--map` does not say; empty for none. In a configuration
+    /// Folder of the map that a run begins or continues unless `--map` names one; empty for none. In a configuration
     /// file a path is relative to that file.
     pub folder: String,
-    /// Whether the camera is only located in it, as `--read-only` does: nothing in the folder changes.
+    /// Whether the camera is only located in it, as with `--read-only`: nothing in the folder changes.
     pub read_only: bool,
-    /// How much of a keyframe is kept of a map that is begun: `full` or `small`.
+    /// How much of each keyframe a new map keeps: `full` or `small`.
     pub detail: MapDetail,
 }
 
-/// Who starts and watches the three.
+/// Starting and watching the three processes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SupervisorConfig {
-    /// Live: how often in a row processes that die within two seconds of their start are started again
-    /// before the run is given up. A process that has lived longer is always restarted, and so is one that was
-    /// ready and was killed (SIGKILL), up to ten times in a row.
+    /// Live: how often in a row processes that die within two seconds of their start are restarted before the run is
+    /// given up. A process that has lived longer is always restarted, and so is one that was ready and was killed
+    /// (SIGKILL), up to ten times in a row.
     pub max_restarts: u32,
-    /// Longest time without a sign of life of a process before it is killed, seconds; live it is started again,
-    /// in lockstep the run ends. 0 waits forever.
+    /// Longest time without a sign of life from a process before it is killed, seconds; live it is restarted, in
+    /// lockstep the run ends. 0 waits forever.
     pub watchdog_s: f64,
     /// Longest wait for a process to end before it is killed, seconds.
     pub stop_timeout_s: f64,
@@ -199,7 +199,7 @@ impl Default for Config {
 }
 
 impl Config {
-    /// Reads the file, where one is named, and applies `settings`, each `key=value`, in their order.
+    /// Reads the file, if one is named, and applies `settings`, each `key=value`, in order.
     pub fn load(file: Option<&Path>, settings: &[String]) -> Result<Self, ConfigError> {
         let mut table = Table::new();
         if let Some(path) = file {
@@ -217,31 +217,31 @@ impl Config {
         Ok(config)
     }
 
-    /// The keys that a file names, none of them below `[expert]`.
+    /// Reads the keys that a file names, without `expert.`.
     fn read_table(file: &Path) -> Result<Table, ConfigError> {
         let text = input_file::read_text(file, MAX_FILE_BYTES)
             .map_err(|source| ConfigError::Read { path: file.to_owned(), source })?;
         Ok(Self::read(&text, &file.display().to_string())?.1)
     }
 
-    /// What can be set about sources.
+    /// Parameters of the sources.
     pub fn source_params(&self) -> SourceParams {
         SourceParams { simulator: self.simulator.clone(), camera: self.capture.camera.clone() }
     }
 
-    /// The configuration as TOML, every key, in the two parts of the shipped file.
+    /// The configuration as TOML with every key, in the two parts of the shipped file.
     pub fn to_text(&self) -> String {
-        // Every field is a plain value: nothing that TOML cannot say. As text, numbers keep their shortest form.
+        // Every field is a plain value that TOML can hold. As text, numbers keep their shortest form.
         let flat = toml::to_string(self).unwrap_or_default().parse().unwrap_or_default();
         toml::to_string(&layout::split(flat)).unwrap_or_default()
     }
 
-    /// Reads the text of a configuration that came from `file`; what it does not name has its default.
+    /// Reads the text of a configuration that came from `file`; keys it does not name have their defaults.
     pub fn from_text(text: &str, file: &str) -> Result<Self, ConfigError> {
         Self::read(text, file).map(|(config, _)| config)
     }
 
-    /// The configuration of a text, and the keys that the text names, none of them below `[expert]`.
+    /// The configuration in a text, and the keys that the text names, without `expert.`.
     fn read(text: &str, file: &str) -> Result<(Self, Table), ConfigError> {
         let syntax = |span: Option<Range<usize>>, message: &str| {
             let before = span.as_ref().and_then(|span| text.get(..span.start));
@@ -274,8 +274,8 @@ impl Config {
         Ok(config)
     }
 
-    /// Checks every value, where an error names `place` and the key as the shipped file lists it, and passes on what
-    /// is shared.
+    /// Checks every value, with errors that name `place` and the key as the shipped file lists it, and passes on shared
+    /// values.
     fn complete(&mut self, place: &str) -> Result<(), ConfigError> {
         self.validate().map_err(|source| {
             let source = ParameterError { key: layout::listed(&source.key), ..source };
@@ -285,7 +285,7 @@ impl Config {
         Ok(())
     }
 
-    /// Gives tracker and mapper what they have in common.
+    /// Gives tracker and mapper the values they share.
     fn share(&mut self) {
         let (tracking, mapping) = (&mut self.tracking, &mut self.mapping);
         mapping.reuse.distance = tracking.keyframe_distance();
@@ -297,7 +297,7 @@ impl Config {
 
     /// Checks every value.
     fn validate(&self) -> Result<(), ParameterError> {
-        // Longer than an hour is a mistake of unit.
+        // More than an hour is a mistaken unit.
         let seconds = 0.1..=3600.0;
         let capture = &self.capture;
         check_range("capture.connect_timeout_s", capture.connect_timeout_s, seconds.clone())?;
@@ -316,7 +316,7 @@ impl Config {
         check_range("mapper.threads", self.mapper.threads, 0..=256)?;
         let supervisor = &self.supervisor;
         check_range("supervisor.max_restarts", supervisor.max_restarts, 0..=1000)?;
-        // Signs of life come once a second: less than two would kill those that a busy machine holds up.
+        // Signs of life arrive once a second: less than two would kill processes that a busy machine delays.
         if supervisor.watchdog_s != 0.0 {
             check_range("supervisor.watchdog_s", supervisor.watchdog_s, 2.0..=3600.0)?;
         }
@@ -330,7 +330,7 @@ impl Config {
     }
 }
 
-/// The file in `folder` for `instance`: its own, else the one for all; `None` where there is neither.
+/// The file in `folder` for `instance`: its own, else the common one; `None` where neither exists.
 pub fn file_for(folder: &Path, instance: Option<&str>) -> Option<PathBuf> {
     // An invalid name must not lead out of the folder; it is refused later.
     let instance = instance.filter(|name| !name.contains('/'));
@@ -338,7 +338,7 @@ pub fn file_for(folder: &Path, instance: Option<&str>) -> Option<PathBuf> {
     own.into_iter().chain([folder.join(COMMON_FILE)]).find(|file| file.exists())
 }
 
-/// Makes a path of the configuration `file` relative to that file, wherever the program is started.
+/// Makes a path in the configuration `file` relative to that file, wherever the program is started.
 fn place_beside(table: &mut Table, file: &Path, [part, key]: [&str; 2]) {
     let part = table.get_mut(part).and_then(Value::as_table_mut);
     let Some(Value::String(path)) = part.and_then(|part| part.get_mut(key)) else {
@@ -349,7 +349,7 @@ fn place_beside(table: &mut Table, file: &Path, [part, key]: [&str; 2]) {
     }
 }
 
-/// A message of the parser in the words of who writes a configuration.
+/// Rewords a message of the parser for the author of a configuration.
 fn without_types(message: &str) -> String {
     const NAMES: [(&str, &str); 8] = [
         ("usize", "a whole number, 0 or more"),
@@ -372,7 +372,7 @@ fn without_types(message: &str) -> String {
     named.or_else(of_table).unwrap_or_else(|| message.to_owned())
 }
 
-/// The parser's message with the line it points at, on one line.
+/// The parser's message with the line it points to, on one line.
 fn one_line(message: &str, span: Option<Range<usize>>, text: &str) -> String {
     let message = message.split_whitespace().collect::<Vec<_>>().join(" ");
     let message = without_types(&message);
@@ -386,7 +386,7 @@ fn one_line(message: &str, span: Option<Range<usize>>, text: &str) -> String {
     }
 }
 
-/// The first key of `table`, in full, that is not in `known`, and which there are in its place.
+/// The first key of `table`, in full, that is not in `known`, and the keys allowed in its place.
 fn unknown_key(table: &Table, known: &Table, prefix: &str) -> Option<String> {
     table.iter().find_map(|(key, value)| match (value, known.get(key)) {
         (_, None) => {
@@ -404,7 +404,7 @@ fn unknown_key(table: &Table, known: &Table, prefix: &str) -> Option<String> {
     })
 }
 
-/// Puts `key.of.tables=value` into `table`. A value that is no TOML is a text.
+/// Puts `key.of.tables=value` into `table`. A value that is not valid TOML is taken as text.
 fn apply(table: &mut Table, setting: &str) -> Result<(), String> {
     let form = "write it as key=value, as in mapper.threads=2";
     let (path, value) = setting.split_once('=').ok_or_else(|| form.to_owned())?;

@@ -12,10 +12,10 @@ pub enum ConfigError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
-    /// A key or a value is not understood.
+    /// A key or a value is invalid.
     #[error("{place}: {reason}")]
     Syntax {
         /// File and line, or the option.

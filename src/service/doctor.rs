@@ -1,4 +1,4 @@
-//! What on this machine will cost latency or fail: each finding with the command that fixes it.
+//! Finds what on this machine will cost latency or fail, each finding with the command that fixes it.
 
 mod cameras;
 mod processes;
@@ -23,22 +23,22 @@ use crate::wire::topic::shared_memory_bytes;
 pub enum Severity {
     /// As it should be.
     Ok,
-    /// It works, but later or less surely than it could.
+    /// It works, but later or less reliably than it could.
     Warning,
     /// It will not work.
     Error,
 }
 
-/// One thing that was looked at.
+/// Result of one check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// What was looked at.
+    /// What was checked.
     pub subject: &'static str,
     /// How bad it is.
     pub severity: Severity,
     /// What was found.
     pub found: String,
-    /// The line that fixes it; empty where nothing needs fixing.
+    /// The command that fixes it; empty where nothing needs fixing.
     pub remedy: String,
 }
 
@@ -58,17 +58,17 @@ impl Finding {
     }
 }
 
-/// The largest camera that is usual: what shared memory must hold.
+/// The largest usual camera, which shared memory must hold.
 const LARGE_CAMERA: Intrinsics = Intrinsics::pinhole(1280, 720, 1000.0);
-/// The smallest limit of locked memory that a tracker needs, bytes.
+/// The smallest limit on locked memory that a tracker needs, bytes.
 const MIN_LOCKED_BYTES: u64 = 512 << 20;
 
-/// The files that the kernel shows, below `root` (`/`).
+/// The kernel's files below `root` (`/`).
 #[derive(Debug, Clone)]
 pub struct Machine {
     /// Folder that holds `proc`, `sys` and `dev`.
     pub root: PathBuf,
-    /// How a camera is asked whether it can be used.
+    /// How to check whether a camera can be used.
     camera_access: CameraAccess,
 }
 
@@ -78,7 +78,7 @@ impl Default for Machine {
     }
 }
 
-/// Looks at everything.
+/// Runs every check.
 pub fn examine(machine: &Machine, config: &Config) -> Vec<Finding> {
     let mut findings = vec![
         real_time_limit(config),
@@ -140,7 +140,7 @@ fn memory_limit(config: &Config) -> Finding {
     }
 }
 
-/// The name of this user: services have no USER, and `usermod` takes no numbers.
+/// Name of this user: services have no USER, and `usermod` accepts no numbers.
 fn user() -> String {
     let number = rustix::process::geteuid().as_raw().to_string();
     let users = fs::read_to_string("/etc/passwd").unwrap_or_default();
@@ -184,7 +184,7 @@ fn runtime_folder(config: &Config) -> Finding {
     let existed = place.root.exists();
     let made = place.create();
     if !existed {
-        // Only a trial: what was not there is not there afterwards.
+        // Only a trial: a folder that did not exist is removed again.
         drop(fs::remove_dir(&place.root));
     }
     match made {
@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_slow_is_found_with_its_remedy() {
+    fn slow_settings_are_found_with_their_remedies() {
         let (_folder, machine) = machine(&[
             ("sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "powersave\n"),
             ("sys/devices/system/clocksource/clocksource0/current_clocksource", "hpet\n"),
@@ -303,7 +303,7 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_as_it_should_be_has_no_remedies() {
+    fn a_well_configured_machine_has_no_remedies() {
         let (_folder, machine) = machine(&[
             ("sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "performance"),
             ("sys/devices/system/clocksource/clocksource0/current_clocksource", "tsc"),
@@ -317,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn a_kernel_that_shows_nothing_is_no_fault() {
+    fn missing_kernel_files_are_not_a_fault() {
         let (_folder, machine) = machine(&[]);
         let findings = [machine.governor(), machine.clock_source(), machine.real_time_throttling()];
         assert!(findings.iter().all(|finding| finding.severity == Severity::Ok));

@@ -1,20 +1,20 @@
-//! Being awake before the frame: a CPU that sleeps takes a tenth of a millisecond to wake. Where the next
-//! frame is expected the loop gets up a little earlier and looks until it is there.
+//! Waking before a frame: a sleeping CPU takes a tenth of a millisecond to wake. Shortly before the next frame is
+//! expected the loop wakes and polls until it arrives.
 
 use std::time::Duration;
 
-/// Until when to sleep, and until when to look from then on.
+/// When to wake, and until when to poll.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Watch {
-    /// CLOCK_MONOTONIC at which to get up, nanoseconds.
+    /// CLOCK_MONOTONIC at which to wake, nanoseconds.
     pub begin_nanos: i64,
     /// CLOCK_MONOTONIC at which to go back to sleep, nanoseconds.
     pub end_nanos: i64,
 }
 
 impl Watch {
-    /// The watch for a frame that comes `period_nanos` after the last arrival: from `early_us`
-    /// microseconds before until as long after; `None` where that is 0, nothing is expected, or its time is over.
+    /// Plans the watch for a frame expected `period_nanos` after the last arrival: from `early_us` microseconds before
+    /// until as long after; `None` where that is 0, no frame is expected, or its time has passed.
     pub fn plan(
         early_us: f64,
         last_arrival_nanos: Option<i64>,
@@ -33,7 +33,7 @@ impl Watch {
         Duration::from_nanos(self.begin_nanos.saturating_sub(now_nanos).max(0) as u64)
     }
 
-    /// Whether the time to look has come and is not over.
+    /// Whether `now_nanos` lies within the watch.
     pub fn is_on(&self, now_nanos: i64) -> bool {
         (self.begin_nanos..self.end_nanos).contains(&now_nanos)
     }
@@ -46,7 +46,7 @@ mod tests {
     const PERIOD_NANOS: i64 = 33_000_000;
 
     #[test]
-    fn the_loop_gets_up_before_the_frame_and_lies_down_when_it_does_not_come() {
+    fn the_loop_wakes_before_the_frame_and_sleeps_again_when_none_arrives() {
         let watch = Watch::plan(300.0, Some(1_000), PERIOD_NANOS, 2_000).unwrap();
         assert_eq!(watch.sleep(1_000), Duration::from_nanos(PERIOD_NANOS as u64 - 300_000));
         let expected = 1_000 + PERIOD_NANOS;
@@ -64,11 +64,11 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_watched_for_where_nothing_is_expected() {
+    fn no_watch_is_planned_where_no_frame_is_expected() {
         assert_eq!(Watch::plan(0.0, Some(0), PERIOD_NANOS, 0), None);
         assert_eq!(Watch::plan(300.0, None, PERIOD_NANOS, 0), None);
         assert_eq!(Watch::plan(300.0, Some(i64::MAX), PERIOD_NANOS, 0), None);
-        // At most a quarter of the period, either way: the CPU belongs to others too.
+        // At most a quarter of the period, either way: other work needs the CPU too.
         let watch = Watch::plan(1e6, Some(0), 4_000_000, 0).unwrap();
         assert_eq!((watch.begin_nanos, watch.end_nanos), (3_000_000, 5_000_000));
     }

@@ -1,5 +1,5 @@
-//! Standard error for a process that must not wait for whoever reads it: lines go to a thread that writes them,
-//! and lines for which it has no room are counted and dropped.
+//! Standard error for a process that must not wait for its reader: a thread writes the lines, and lines that do not fit
+//! into its queue are counted and dropped.
 
 use std::io::{self, Write};
 use std::sync::Arc;
@@ -9,16 +9,16 @@ use std::time::Duration;
 use crossbeam::channel::{Receiver, SendTimeoutError, Sender, bounded};
 use tracing_subscriber::fmt::MakeWriter;
 
-/// Lines that wait while standard error takes none: minutes of a usual log, at most a few megabytes.
+/// Lines that wait while standard error accepts none: minutes of a usual log, at most a few megabytes.
 const WAITING_LINES: usize = 4096;
 
 enum Entry {
     Line(Vec<u8>),
-    /// Everything before it is written.
+    /// Answered once everything before it is written.
     Mark(Sender<()>),
 }
 
-/// Writes lines to standard error without ever waiting for it. A copy writes to the same.
+/// Writes lines to standard error without ever waiting for it. Clones share one thread.
 #[derive(Debug, Clone)]
 pub struct ErrorLog {
     entries: Sender<Entry>,
@@ -26,7 +26,7 @@ pub struct ErrorLog {
 }
 
 impl ErrorLog {
-    /// Starts the thread that writes to standard error; it ends with the last copy.
+    /// Starts the thread that writes to standard error; it ends with the last clone.
     pub fn start() -> io::Result<Self> {
         let (log, entries) = Self::with_room(WAITING_LINES);
         let thread = std::thread::Builder::new().name("semidense-log".to_owned());
@@ -39,7 +39,7 @@ impl ErrorLog {
         (Self { entries, dropped: Arc::default() }, receiver)
     }
 
-    /// Waits until everything so far is written, at most for `longest`; whether it is.
+    /// Waits up to `longest` until everything so far is written; returns whether it is.
     pub fn wait_written(&self, longest: Duration) -> bool {
         let (done, is_done) = bounded(1);
         match self.entries.send_timeout(Entry::Mark(done), longest) {
@@ -48,13 +48,13 @@ impl ErrorLog {
         }
     }
 
-    /// Lines that were dropped so far.
+    /// Lines dropped so far.
     pub fn dropped_lines(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
     }
 }
 
-/// One call is one line or several, with the end of the line.
+/// One call writes one or more whole lines, with their line ends.
 impl Write for ErrorLog {
     fn write(&mut self, text: &[u8]) -> io::Result<usize> {
         if self.entries.try_send(Entry::Line(text.to_vec())).is_err() {
@@ -91,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_without_room_are_counted_and_the_others_come_in_order() {
+    fn lines_beyond_the_queue_are_counted_and_the_others_keep_their_order() {
         let (mut log, entries) = ErrorLog::with_room(2);
         for line in ["one\n", "two\n", "three\n"] {
             log.write_all(line.as_bytes()).unwrap();

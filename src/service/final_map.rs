@@ -1,4 +1,4 @@
-//! The map at the end of a run: asked of the mapper, which writes it into a file.
+//! The map at the end of a run: requested from the mapper, which writes it into a file.
 
 use std::io;
 use std::path::Path;
@@ -15,7 +15,7 @@ use crate::slam::map::Map;
 use crate::wire::command::{Command, CommandClient, CommandError};
 use crate::wire::port::ReceiveError;
 
-/// Why the mapper gives no map.
+/// Why the mapper provides no map.
 #[derive(Debug, thiserror::Error)]
 pub enum FinalMapError {
     /// It does not answer.
@@ -30,7 +30,7 @@ pub enum FinalMapError {
     /// It refuses, or takes too long.
     #[error("{0}; the map is that of its last checkpoint")]
     Command(#[from] CommandError),
-    /// What it wrote cannot be read.
+    /// Its file cannot be read.
     #[error(transparent)]
     File(#[from] MapFileError),
     /// The folder has no path that another process could use.
@@ -38,8 +38,8 @@ pub enum FinalMapError {
     Path(#[from] io::Error),
 }
 
-/// Has the mapper write its map into `folder`, and reads it. One that hangs is not waited for: it is given
-/// as long to begin as the watchdog allows between two signs of life, and only then the time that writing may take.
+/// Has the mapper write its map into `folder`, and reads it. Does not wait for a mapper that hangs: it must begin
+/// within the watchdog's time between two signs of life, and only then has the time allowed for writing.
 pub fn final_map(
     mapper: &mut Supervised,
     commands: &CommandClient,

@@ -1,32 +1,32 @@
-//! The order of frames as they arrive: what is missing, repeated or out of order, and how far apart they are.
+//! The order of frames as they arrive: which are missing, repeated or out of order, and their period.
 
 use crate::service::clock::now_nanos;
 use crate::wire::message::FrameHeader;
 
-/// Distance of two frames before any is known: 30 Hz.
+/// Period before any is measured: 30 Hz.
 const FIRST_PERIOD_NANOS: i64 = 33_000_000;
-/// Distances that cameras have: from 1000 Hz to one in five seconds. What lies outside is a jump of the
-/// source's clock.
+/// Periods of real cameras: from 1000 Hz to one frame in five seconds. Anything outside is a jump of the source's
+/// clock.
 const PERIODS_NANOS: std::ops::RangeInclusive<i64> = 1_000_000..=5_000_000_000;
-/// So many frames in a row that seem repeated are a source that counts anew.
+/// This many seemingly repeated frames in a row mean a source that has restarted its numbering.
 const RENUMBERED_FRAMES: u32 = 10;
 
-/// What a process says whose frames have stopped coming.
+/// Cause that a process reports when its frames have stopped.
 pub const SILENCE: &str = "no frames come: look at capture";
 
-/// What a frame is to the one before.
+/// How a frame relates to the previous one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FrameOrderOutcome {
-    /// It comes after it; so many are missing between.
+    /// It follows the previous one; this many are missing in between.
     Next {
         /// Frames that did not arrive.
         missing: u64,
     },
-    /// It comes after it, but the source's clock has jumped.
+    /// It follows the previous one, but the source's clock has jumped.
     ClockJump,
-    /// It is the same again, or an older one: not to be used.
+    /// The same frame again, or an older one: not to be used.
     Repeated,
-    /// The source counts anew.
+    /// The source has restarted its numbering.
     Renumbered,
 }
 
@@ -39,19 +39,19 @@ pub struct FrameOrder {
 }
 
 impl FrameOrder {
-    /// Time between two frames, by the stamps of the last two.
+    /// Time between two frames, from the stamps of the last two.
     pub fn period_nanos(&self) -> i64 {
         self.period_nanos.unwrap_or(FIRST_PERIOD_NANOS)
     }
 
-    /// Whether frames have stopped coming: none for so many periods since the last one.
+    /// Whether frames have stopped: none for `periods` periods since the last one.
     pub fn is_silent(&self, last_arrival_nanos: Option<i64>, periods: f64) -> bool {
         let allowed_nanos = periods * self.period_nanos() as f64;
         last_arrival_nanos
             .is_some_and(|last| now_nanos().saturating_sub(last) as f64 > allowed_nanos)
     }
 
-    /// Says what the next frame is. Accepts arbitrary numbers.
+    /// Classifies the next frame. Accepts arbitrary input.
     pub fn arrive(&mut self, header: &FrameHeader) -> FrameOrderOutcome {
         let (sequence, stamp) = (header.sequence, header.capture_nanos);
         let Some((last_sequence, last_stamp)) = self.last else {
@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn holes_and_distances_are_found() {
+    fn gaps_and_periods_are_found() {
         let mut order = FrameOrder::default();
         assert_eq!(order.arrive(&frame(7, 0)), FrameOrderOutcome::Next { missing: 0 });
         assert_eq!(order.arrive(&frame(8, 20)), FrameOrderOutcome::Next { missing: 0 });
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn repeated_frames_are_refused_until_the_source_counts_anew() {
+    fn repeated_frames_are_refused_until_the_source_is_renumbered() {
         let mut order = FrameOrder::default();
         order.arrive(&frame(100, 0));
         assert_eq!(order.arrive(&frame(100, 0)), FrameOrderOutcome::Repeated);
@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn jumps_of_the_clock_do_not_become_a_period() {
+    fn clock_jumps_do_not_become_a_period() {
         let mut order = FrameOrder::default();
         order.arrive(&frame(0, 0));
         order.arrive(&frame(1, 40));

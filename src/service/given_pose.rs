@@ -1,5 +1,4 @@
-//! A frame's pose from ground truth, in the words of the tracker, so that the mapper can be run and
-//! judged alone.
+//! A frame's pose from ground truth, as a tracking result, so that the mapper can be run and evaluated alone.
 
 use crate::slam::evaluation::MAX_DIFFERENCE_NANOS;
 use crate::slam::evaluation::association::nearest;
@@ -10,8 +9,8 @@ use crate::slam::pose::{PoseEstimate, Quality, TrackingState};
 use crate::slam::tracker::TrackerParams;
 use crate::slam::trajectory::StampedPose;
 
-/// The true poses with the camera of the first frame that has one as the world, as a map has it
-/// whose first keyframe is the identity; empty where no pose is near `first_nanos` or later.
+/// The true poses relative to the camera of the first frame that has one, as in a map whose first keyframe is the
+/// identity; empty where no pose is near `first_nanos` or later.
 pub fn truth_in_first_camera(ground_truth: &[StampedPose], first_nanos: i64) -> Vec<StampedPose> {
     let earliest = first_nanos.saturating_sub(MAX_DIFFERENCE_NANOS);
     let later = ground_truth.partition_point(|pose| pose.nanos < earliest);
@@ -25,9 +24,8 @@ pub fn truth_in_first_camera(ground_truth: &[StampedPose], first_nanos: i64) -> 
     ground_truth.iter().map(place).collect()
 }
 
-/// The true pose of `frame`, exact (covariance zero), relative to `keyframe`; `None` where no true
-/// pose is near enough in time. Whether a keyframe is due is judged from the geometry, with the
-/// tracker's weights.
+/// The true pose of `frame`, exact (covariance zero), relative to `keyframe`; `None` where no true pose is near enough
+/// in time. Whether a keyframe is due follows from the geometry, with the tracker's weights.
 pub fn given_pose(
     frame: &FrameView<'_>,
     keyframe: Option<&Keyframe>,
@@ -54,7 +52,7 @@ pub fn given_pose(
     Some(estimate)
 }
 
-/// What a tracker would find out about the view of a keyframe's points, and whether it would propose another one.
+/// The quality that a tracker would find in its view of a keyframe, and whether it would propose another one.
 fn view_of(
     keyframe: &Keyframe,
     keyframe_from_camera: &SE3,
@@ -145,7 +143,7 @@ mod tests {
         let near = give(1_010_000_000).unwrap();
         assert!((near.keyframe_from_camera.translation.x - 0.02).abs() < 1e-12);
         assert_eq!((near.keyframe_id, near.revision), (4, 9));
-        // 0.02 units at 100 px / 2 units: one pixel to the left; the first column goes out of view.
+        // 0.02 units at 100 px / 2 units: one pixel to the left; the first column leaves the view.
         assert!((near.quality.mean_squared_flow - 1.0).abs() < 1e-9);
         assert!((near.quality.in_view_ratio - 0.9).abs() < 1e-9);
         assert!(!near.proposes_keyframe);

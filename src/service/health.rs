@@ -12,11 +12,11 @@ use crate::wire::topic::Topic;
 
 /// Time between two reports when nothing changes.
 const REPORT_PERIOD_NANOS: i64 = 1_000_000_000;
-/// Time between two reports of progress: smooth to the eye, nothing for the machine.
+/// Time between two progress reports: smooth to the eye, negligible for the machine.
 const PROGRESS_PERIOD_NANOS: i64 = 100_000_000;
 
-/// Shortest time between two reports of rare events: they go out at once, so that a kill loses none, but a process
-/// that counts one with every frame must not do more reporting than work.
+/// Shortest time between two reports of rare events: they are sent at once, so that a kill loses none, but a process
+/// that counts one with every frame must not spend more time on reports than on work.
 const EVENT_PERIOD_NANOS: i64 = 10_000_000;
 
 /// What a process is doing.
@@ -24,7 +24,7 @@ const EVENT_PERIOD_NANOS: i64 = 10_000_000;
 pub enum ProcessState {
     /// It opens its ports and its input.
     Starting,
-    /// It does what must be over before the first frame.
+    /// It completes what must precede the first frame.
     Preparing,
     /// It waits for the first frame.
     Ready,
@@ -34,7 +34,7 @@ pub enum ProcessState {
     Finished,
     /// It cannot continue.
     Failed,
-    /// It works, but its input has stopped coming.
+    /// It works, but its input has stopped.
     Stale,
 }
 
@@ -49,7 +49,7 @@ impl ProcessState {
         (Self::Stale, 6, "stale"),
     ];
 
-    /// The state of a code; `None` for one that stands for nothing.
+    /// The state of a code; `None` for an invalid code.
     pub fn from_code(code: u32) -> Option<Self> {
         Self::ALL.iter().find(|(_, c, _)| *c == code).map(|(state, ..)| *state)
     }
@@ -65,7 +65,7 @@ impl ProcessState {
     }
 }
 
-/// The bucket of a latency: half octaves from 1 µs, the last holds all from 12 s.
+/// The bucket of a latency: half octaves from 1 µs, the last holds everything from 12 s.
 pub fn bucket(nanos: u64) -> usize {
     let micros = nanos / 1000;
     if micros == 0 {
@@ -77,9 +77,9 @@ pub fn bucket(nanos: u64) -> usize {
     (2 * octave + usize::from(upper)).min(HISTOGRAM_BUCKETS - 1)
 }
 
-/// The latency in milliseconds that `share` (0 to 1) of the counted ones do not exceed, taken to be spread
-/// evenly over their bucket: right to a few percent where many fell into it, never beyond its end. `None`
-/// where nothing was counted.
+/// The latency in milliseconds that `share` (0 to 1) of the counted ones do not exceed, assuming an even spread over
+/// their bucket: accurate to a few percent where many fell into it, never beyond its end. `None` where nothing was
+/// counted.
 pub fn percentile_ms(counts: &[u64; HISTOGRAM_BUCKETS], share: f64) -> Option<f64> {
     let total: u64 = counts.iter().fold(0, |sum, &count| sum.saturating_add(count));
     let wanted = (share * total as f64).ceil().max(1.0);
@@ -96,7 +96,7 @@ pub fn percentile_ms(counts: &[u64; HISTOGRAM_BUCKETS], share: f64) -> Option<f6
     None
 }
 
-/// Mean of what was counted, milliseconds, each in the middle of its bucket. `None` where nothing was counted.
+/// Mean of the counted latencies, milliseconds, each at the middle of its bucket. `None` where nothing was counted.
 pub fn mean_ms(counts: &[u64; HISTOGRAM_BUCKETS]) -> Option<f64> {
     let begin = |index: usize| if index == 0 { 0.0 } else { bucket_end_ms(index - 1) };
     let middle = |index: usize| 0.5 * (begin(index) + bucket_end_ms(index));
@@ -106,7 +106,7 @@ pub fn mean_ms(counts: &[u64; HISTOGRAM_BUCKETS]) -> Option<f64> {
     (total > 0.0).then_some(sum / total)
 }
 
-/// Where a bucket ends, milliseconds.
+/// End of a bucket, milliseconds.
 pub fn bucket_end_ms(index: usize) -> f64 {
     f64::powf(2.0, (index as f64 + 1.0) / 2.0) / 1000.0
 }
@@ -116,7 +116,7 @@ pub fn cause(message: &HealthMessage) -> String {
     text_from_bytes(&message.cause, message.cause_bytes)
 }
 
-/// Where the frames come from, as text; empty but of capture.
+/// Source of the frames, as text; empty except for capture.
 pub fn source(message: &HealthMessage) -> String {
     text_from_bytes(&message.source, message.source_bytes)
 }
@@ -136,7 +136,7 @@ fn scheduling_code(policy: Option<Policy>) -> u32 {
     }
 }
 
-/// The policy of a code, in words.
+/// Name of a policy from its code.
 pub fn scheduling_name(code: u32) -> &'static str {
     match code {
         0 => "other",
@@ -146,19 +146,19 @@ pub fn scheduling_name(code: u32) -> &'static str {
     }
 }
 
-/// A state with its cause and the bytes of that, as a process has said it.
+/// A state with its cause and the length of that in bytes, as a process reported it.
 pub type StateAndCause = (u32, [u8; TEXT_BYTES], u32);
 
-/// Counts, and publishes when it is time: to everybody who subscribes, and to the service manager.
+/// Counts, and publishes when due: to subscribers and to the service manager.
 #[derive(Debug)]
 pub struct Health {
     publisher: Publisher<HealthMessage, ()>,
     message: HealthMessage,
     changed: bool,
     notice: ManagerNotice,
-    /// Frames that had been counted when the rate was taken last, and when that was.
+    /// Frames counted when the rate was last computed, and the time of that.
     rated: (u64, i64),
-    /// Rare events that the last report told.
+    /// Rare events in the last report.
     told_events: u64,
 }
 
@@ -181,32 +181,32 @@ impl Health {
         Ok(health)
     }
 
-    /// The counters, to be counted up.
+    /// The counters, to be incremented.
     pub fn counters(&mut self) -> &mut HealthMessage {
         &mut self.message
     }
 
-    /// Says where the frames come from; it goes out with the next report.
+    /// Sets the source of the frames; it is sent with the next report.
     pub fn tell_source(&mut self, name: &str) {
         (self.message.source, self.message.source_bytes) = text_bytes(name);
     }
 
-    /// Takes down one latency.
+    /// Counts one latency.
     pub fn count_latency(&mut self, nanos: u64) {
         self.message.latency_counts[bucket(nanos)] += 1;
     }
 
-    /// Takes down the time that the work on a frame took.
+    /// Counts the time that the work on a frame took.
     pub fn count_work(&mut self, nanos: u64) {
         self.message.work_counts[bucket(nanos)] += 1;
     }
 
-    /// Takes down the time from the sending of a frame to the look at it.
+    /// Counts the time from the sending of a frame to its pick-up.
     pub fn count_wake(&mut self, nanos: u64) {
         self.message.wake_counts[bucket(nanos)] += 1;
     }
 
-    /// Takes down a joint estimate of keyframes.
+    /// Counts a joint estimate of keyframes.
     pub fn count_adjustment(&mut self, record: &AdjustmentRecord) {
         self.message.adjustment_counts[bucket(record.nanos)] += 1;
         match record.fate {
@@ -216,7 +216,7 @@ impl Health {
         self.message.adjustments_merged += u64::from(record.fate == Fate::Merged);
     }
 
-    /// Takes down a search for loops; one that proposes a loop continues.
+    /// Counts a search for loops; one that proposes a loop continues.
     pub fn count_search(&mut self, fate: &SearchFate) {
         let of = &mut self.message;
         let count = match fate {
@@ -233,14 +233,14 @@ impl Health {
         of.loop_searches += 1;
     }
 
-    /// Says what the process has to do without from now on.
+    /// Reports what the process does without from now on.
     pub fn warn(&mut self, warning: &str) {
         (self.message.warning, self.message.warning_bytes) = text_bytes(warning);
         self.changed = true;
         self.report();
     }
 
-    /// Says what the kernel does for the calling thread and what it refused; the first refusal as a text.
+    /// Reports the scheduling in force for the calling thread, and the first refusal as text.
     pub fn tell_scheduling(&mut self, refusals: &[Refusal]) {
         let in_force = in_force();
         self.message.scheduling = scheduling_code(in_force.policy);
@@ -249,13 +249,13 @@ impl Health {
         self.warn(&refusals.first().map(Refusal::to_string).unwrap_or_default());
     }
 
-    /// Enters a state; the next report goes out at once.
+    /// Enters a state and reports it at once.
     pub fn enter(&mut self, state: ProcessState, cause: &str) {
         let (cause, cause_bytes) = text_bytes(cause);
         self.go_back_to((state.code(), cause, cause_bytes));
     }
 
-    /// Says how the process has ended: in order, for this cause, or with an error.
+    /// Reports how the process ended: in order, for this cause, or with an error.
     pub fn end(&mut self, outcome: &Result<(), impl std::fmt::Display>, cause: &str) {
         match outcome {
             Ok(()) => self.enter(ProcessState::Finished, cause),
@@ -269,7 +269,7 @@ impl Health {
         (state, cause, cause_bytes)
     }
 
-    /// Enters a state that [`Health::entered`] has given.
+    /// Enters a state obtained from [`Health::entered`].
     pub fn go_back_to(&mut self, wanted: StateAndCause) {
         if wanted == self.entered() {
             return;
@@ -279,7 +279,7 @@ impl Health {
         self.report();
     }
 
-    /// Tells the service manager that everything is open and read: from now on the process does its work.
+    /// Tells the service manager that everything is open and read and that the process now does its work.
     pub fn tell_ready(&mut self) {
         self.notice.ready();
     }
@@ -295,8 +295,8 @@ impl Health {
         self.report();
     }
 
-    /// Publishes when something changed or a second is over, and serves those who came late. The frame loop
-    /// calls it on every turn, so that it is the loop's heartbeat too.
+    /// Publishes when something changed or a second has passed, and serves late subscribers. The frame loop calls it on
+    /// every turn, so that it is also the loop's heartbeat.
     pub fn report(&mut self) {
         self.publisher.serve_late_joiners();
         let now = now_nanos();
@@ -319,7 +319,7 @@ impl Health {
         self.tell_status();
     }
 
-    /// Frames a second since the rate was taken last, when that is a second ago.
+    /// Computes the frames per second since the last computation, once that is a second ago.
     fn take_rate(&mut self, now: i64) {
         let (frames, since) = self.rated;
         if now - since >= REPORT_PERIOD_NANOS {
@@ -329,17 +329,17 @@ impl Health {
         }
     }
 
-    /// The state, its cause and the figures as a line for the service manager.
+    /// Sends the state, its cause and the figures to the service manager as one line.
     fn tell_status(&mut self) {
         let state = ProcessState::from_code(self.message.state).unwrap_or(ProcessState::Failed);
         if matches!(state, ProcessState::Finished | ProcessState::Failed) {
             self.notice.stopping();
         }
         let length = (self.message.cause_bytes as usize).min(TEXT_BYTES);
-        // Our own text, cut at a character.
+        // Our own text, cut at a character boundary.
         let cause = str::from_utf8(&self.message.cause[..length]).unwrap_or_default();
         let separator = if cause.is_empty() { "" } else { ": " };
-        // Before the first second is over nothing is known of the rate.
+        // The rate is unknown until the first second has passed.
         let (name, rate_hz) = (state.name(), self.message.rate_hz.max(0.0));
         let HealthMessage { frames, deadline_misses, refused, .. } = self.message;
         self.notice.status(format_args!(
@@ -348,7 +348,7 @@ impl Health {
     }
 }
 
-/// Events that are counted and are rare, all together: what must not be lost with a process that is killed.
+/// Sum of the rare events, which must not be lost with a process that is killed.
 fn events(message: &HealthMessage) -> u64 {
     let counts = [
         message.dropped,
@@ -415,7 +415,7 @@ mod tests {
     }
 
     #[test]
-    fn searches_for_loops_are_counted_by_what_they_came_to() {
+    fn searches_for_loops_are_counted_by_their_fate() {
         let folder = tempfile::tempdir_in("/tmp").unwrap();
         let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
         let hub = Hub::join(&place, "tracker", Access::Member).unwrap();

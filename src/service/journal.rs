@@ -1,9 +1,9 @@
-//! The journal of a run: what it takes to write its results, on the disk while it continues.
+//! The journal of a run: writes everything needed to reconstruct its results to disk while it runs.
 //!
-//! A folder inside the output folder: `log` has poses, times and keyframe poses as they come, and each keyframe has
-//! a file with its newest depth. Everything is written by a thread of its own and is on the disk after about a
-//! second. The folder goes when the results are written; who finds one that nobody holds finds a run that was
-//! killed, and [`recovered`] makes its record.
+//! A folder inside the output folder: `log` holds poses, times and keyframe poses as they arrive, and each keyframe has
+//! a file with its newest depth. A separate thread writes everything, which is on disk after about a second. The folder
+//! is removed once the results are written; one that no process holds belongs to a run that was killed, and
+//! [`recovered`] makes its record.
 
 mod any_bytes;
 pub(crate) mod feed;
@@ -35,50 +35,50 @@ use crate::slam::map::Map;
 use crate::wire::message::PoseMessage;
 use crate::wire::place::Place;
 
-/// Time between two hand-overs to the thread: that much of a run a kill may cost.
+/// Time between two hand-overs to the thread: a kill may cost that much of a run.
 const PERIOD: Duration = Duration::from_secs(1);
-/// Bytes that are handed over before that: 300 poses, so that a run in lockstep holds no more than one at 30 Hz.
+/// Hand over earlier once this many bytes are pending: 300 poses, so that lockstep holds no more than a run at 30 Hz.
 const HAND_OVER_BYTES: usize = 256 << 10;
-/// Entries that may wait for the disk: at 30 Hz two seconds of poses and a keyframe each.
+/// Entries that may wait for the disk: at 30 Hz two seconds of poses, with a keyframe each second.
 const QUEUE: usize = 4;
 /// Longest wait for the disk at the end.
 const END_TIMEOUT: Duration = Duration::from_secs(60);
-/// Longest wait for a disk that was waited for in vain already.
+/// Longest wait for a disk that has already timed out.
 const SECOND_TIMEOUT: Duration = Duration::from_secs(5);
-/// Most bytes of log that wait for a disk that hangs: an hour of poses.
+/// Most bytes of log that wait for a hanging disk: an hour of poses.
 const MAX_PENDING_BYTES: usize = 64 << 20;
 
 /// Where a journal is kept, and how much.
 #[derive(Debug, Clone)]
 pub struct JournalOptions {
-    /// The output folder; it exists.
+    /// The output folder, which exists.
     pub output: PathBuf,
-    /// How the run is started.
+    /// How the run was started.
     pub start: RunStart,
-    /// Most bytes of depth; beyond it the oldest keyframes keep only their poses, as in the mapper.
+    /// Most bytes of depth; beyond that the oldest keyframes keep only their poses, as in the mapper.
     pub max_depth_bytes: u64,
 }
 
-/// The journal of the run that continues. Dropped without [`Journal::finish`] it stays.
+/// The journal of a run in progress. Stays on disk when dropped without [`Journal::finish`].
 #[derive(Debug)]
 pub struct Journal {
     folder: PathBuf,
     pointer: Option<Pointer>,
-    /// What the thread does not have yet.
+    /// Bytes that the thread does not have yet.
     pending: Vec<u8>,
     counted: Instant,
     handed_over: Instant,
     entries: Option<Sender<Entry>>,
     thread: Option<JoinHandle<()>>,
-    /// How long the disk may take at the end.
+    /// Longest wait for the disk at the end.
     timeout: Duration,
     /// Whether records are left out because the disk hangs.
     leaves_out: bool,
-    /// Poses that were taken in before any record was left out, and how many of them the thread has on the disk.
+    /// Poses appended before any record was left out, and how many of them are on disk.
     poses: u64,
     has_hole: bool,
     on_disk: Arc<AtomicU64>,
-    /// The log, held: says that the run continues.
+    /// The log, held: shows that the run is in progress.
     log: File,
 }
 
@@ -101,11 +101,11 @@ impl Journal {
         Ok(journal)
     }
 
-    /// Holds the journal that a killed run has left in `folder`, so that nobody else makes results of it; `None`
-    /// where somebody does.
+    /// Holds the journal that a killed run left in `folder`, so that no other process makes results from it; `None`
+    /// where another process holds it.
     pub fn take_over(folder: &Path) -> io::Result<Option<Self>> {
         let held = hold(&folder.join(folder::LOG))?;
-        // Who looks for its pointer next removes it.
+        // The next search for its pointer removes the pointer.
         Ok(held.map(|held| Self::of(folder.to_owned(), held, None)))
     }
 
@@ -128,12 +128,12 @@ impl Journal {
         }
     }
 
-    /// Where it is.
+    /// Its folder.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Takes in a record. Never waits for the disk.
+    /// Appends a record. Never waits for the disk.
     pub fn append(&mut self, record: &Record) {
         let has_room = self.pending.len() < MAX_PENDING_BYTES;
         if has_room {
@@ -151,13 +151,12 @@ impl Journal {
         self.tick();
     }
 
-    /// How many of the poses that were taken in, from the first on, are on the disk: [`Journal::read_poses`] gives them
-    /// back.
+    /// How many of the appended poses, from the first on, are on disk; [`Journal::read_poses`] reads them back.
     pub fn poses_on_disk(&self) -> usize {
         usize::try_from(self.on_disk.load(Ordering::Acquire)).unwrap_or(usize::MAX)
     }
 
-    /// Reads the first `count` poses from the disk; fewer where that refuses.
+    /// Reads the first `count` poses from disk; fewer where the disk fails.
     pub fn read_poses(&self, count: usize, take: &mut dyn FnMut(&PoseMessage)) {
         let log = BufReader::new(ReadFromStart { file: &self.log, at: 0 });
         let mut num_read = 0;
@@ -171,18 +170,18 @@ impl Journal {
         });
     }
 
-    /// Whether it is time for [`Journal::count`].
+    /// Whether [`Journal::count`] is due.
     pub fn wants_counters(&self) -> bool {
         self.counted.elapsed() >= PERIOD
     }
 
-    /// Takes in what was counted until now.
+    /// Appends the counts so far.
     pub fn count(&mut self, counters: RunCounters) {
         self.counted = Instant::now();
         self.append(&Record::Counters(Box::new(counters)));
     }
 
-    /// Takes in the newest state of a keyframe; gives it back where the disk is behind. Never waits.
+    /// Appends the newest state of a keyframe; returns it where the disk is behind. Never waits.
     pub fn put_keyframe(&mut self, keyframe: Keyframe) -> Option<Keyframe> {
         let without_depth = keyframe.without_depth();
         let entries = self.entries.as_ref()?;
@@ -207,7 +206,7 @@ impl Journal {
         }
     }
 
-    /// Waits until everything is on the disk, or for a bounded time; whether it is.
+    /// Waits, for a bounded time, until everything is on disk; returns whether it is.
     pub fn flush(&mut self) -> bool {
         let Some(entries) = &self.entries else { return true };
         let end = Instant::now() + self.timeout;
@@ -233,7 +232,7 @@ impl Journal {
         is_whole
     }
 
-    /// The map as the journal has it, at most `max_bytes` of depth; none where the disk does not answer.
+    /// The map in the journal, with at most `max_bytes` of depth; empty where the disk does not respond.
     pub fn map(&mut self, max_bytes: u64) -> Map {
         match self.flush() {
             true => read_map_of(&self.folder, max_bytes),
@@ -241,7 +240,7 @@ impl Journal {
         }
     }
 
-    /// The results are written, or there are none: the journal goes.
+    /// Removes the journal, once the results are written or where there are none.
     pub fn finish(mut self) -> io::Result<()> {
         if !self.close() {
             return Err(io::Error::new(io::ErrorKind::TimedOut, "its disk does not answer"));
@@ -251,7 +250,7 @@ impl Journal {
         Ok(())
     }
 
-    /// Ends the thread, which is left alone where its disk hangs; whether it has ended.
+    /// Ends the thread, or leaves it alone where its disk hangs; returns whether it has ended.
     fn close(&mut self) -> bool {
         self.flush();
         self.entries = None;
@@ -266,7 +265,7 @@ impl Journal {
     }
 }
 
-/// Reads a file that another thread writes to: the place in it is not shared.
+/// Reads a file that another thread writes to, with a separate position.
 struct ReadFromStart<'a> {
     file: &'a File,
     at: u64,
@@ -307,7 +306,7 @@ mod tests {
         pose_message(&PoseEstimate::unknown(&frame), &PoseTiming::default())
     }
 
-    /// A journal in `folder` without pointer.
+    /// A journal in `folder` without a pointer.
     fn journal(folder: &Path) -> Journal {
         let writer = Writer::create(folder, &log_header(), 1 << 20).unwrap();
         let (held, on_disk) = (writer.hold().unwrap(), writer.poses_on_disk());
@@ -319,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn poses_on_the_disk_need_no_memory_and_come_back() {
+    fn poses_on_disk_need_no_memory_and_are_read_back() {
         let folder = tempfile::tempdir().unwrap();
         let mut journal = journal(folder.path());
         let mut recording = Recording::default();
@@ -333,7 +332,7 @@ mod tests {
                 assert_eq!(recording.num_released(), 2001, "what is on the disk is not held");
             }
         }
-        // The user has taken the folder away: the log is open.
+        // The user has removed the folder's log: it is still open.
         std::fs::remove_file(folder.path().join(folder::LOG)).unwrap();
         let mut found = Vec::new();
         journal.read_poses(recording.num_released(), &mut |pose| found.push(*pose));
@@ -343,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn poses_after_one_that_was_left_out_are_not_counted() {
+    fn poses_after_an_omitted_one_are_not_counted() {
         let folder = tempfile::tempdir().unwrap();
         let mut journal = journal(folder.path());
         let append = |journal: &mut Journal, sequence| {
@@ -351,7 +350,7 @@ mod tests {
         };
         append(&mut journal, 0);
         assert!(journal.flush());
-        // The disk has hung for an hour, and answers again.
+        // The disk has hung for an hour and responds again.
         journal.pending = vec![0; MAX_PENDING_BYTES];
         append(&mut journal, 1);
         journal.pending = Vec::new();
@@ -361,13 +360,13 @@ mod tests {
     }
 
     #[test]
-    fn a_disk_that_hangs_holds_up_neither_the_run_nor_its_end() {
+    fn a_hanging_disk_delays_neither_the_run_nor_its_end() {
         let folder = tempfile::tempdir().unwrap();
         let held = tempfile::tempfile().unwrap();
         let (entries, received) = bounded(QUEUE);
         let (release, hangs) = bounded::<()>(0);
         let thread = std::thread::spawn(move || {
-            // As in a write that does not come back.
+            // As in a write that never returns.
             let _ = hangs.recv();
             drop(received);
         });
@@ -378,7 +377,7 @@ mod tests {
         record.write(&mut bytes);
         for _ in 0..MAX_PENDING_BYTES / bytes.len() + 1000 {
             journal.append(&record);
-            // Each is due.
+            // Makes each one due.
             journal.handed_over -= PERIOD;
         }
         assert!(

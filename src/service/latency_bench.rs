@@ -1,4 +1,4 @@
-//! Latency under trial: the three processes live on a repeated sequence, beside what may disturb them.
+//! Latency trials: the three processes live on a repeated sequence, alongside possible disturbances.
 
 use std::ffi::OsString;
 use std::hint::black_box;
@@ -27,10 +27,10 @@ use crate::wire::topic::{FRAME, POSE};
 
 /// How long the slow reader holds a frame: many frame periods.
 const SLOW_READER_PAUSE: Duration = Duration::from_millis(500);
-/// Pause of a reader that has nothing to do.
+/// Pause of an idle reader.
 const READER_PAUSE: Duration = Duration::from_millis(20);
-/// Settings that make a map step longer than a frame period: all pixels carry depth, and it is smoothed
-/// and published with every frame, by one thread.
+/// Settings that make a map step longer than a frame period: all pixels carry depth, which is smoothed and published
+/// with every frame, by one thread.
 const SATURATED_MAPPER: [&str; 3] =
     ["mapping.min_gradient=0.5", "mapping.publish_change_ratio=0.0", "mapper.threads=1"];
 /// Settings of real-time scheduling.
@@ -43,19 +43,19 @@ const REAL_TIME: [&str; 6] = [
     "tracker.early_wake_us=300.0",
 ];
 
-/// What runs beside the pipeline.
+/// Disturbance alongside the pipeline.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Disturbance {
     /// Nothing.
     Idle,
-    /// A busy thread for each CPU.
+    /// One busy thread per CPU.
     BusyCpus,
-    /// The mapper has more to do than it can.
+    /// More work for the mapper than it can do.
     SaturatedMapper,
-    /// Somebody reads frames and poses slowly and holds what he has.
+    /// A subscriber that reads frames and poses slowly and holds them.
     SlowReader,
-    /// Somebody subscribes and never reads.
+    /// A subscriber that never reads.
     DeafReader,
 }
 
@@ -79,51 +79,51 @@ impl Disturbance {
 /// One trial.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Trial {
-    /// What runs beside.
+    /// Disturbance alongside the pipeline.
     pub disturbance: Disturbance,
     /// Whether capture and tracker run under FIFO scheduling with locked memory.
     pub real_time: bool,
     /// Frames.
     pub frames: u64,
-    /// Frames in a second.
+    /// Frames per second.
     pub rate_hz: f64,
 }
 
-/// What came of a trial.
+/// Result of a trial.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Measurement {
-    /// What ran beside.
+    /// Disturbance alongside the pipeline.
     pub disturbance: Disturbance,
-    /// Whether real-time scheduling was asked for.
+    /// Whether real-time scheduling was requested.
     pub real_time: bool,
-    /// Frames in a second.
+    /// Frames per second.
     pub rate_hz: f64,
     /// Frames that capture sent.
     pub frames: u64,
-    /// Poses that came of them.
+    /// Poses published for them.
     pub poses: u64,
-    /// Of them those that are claimed.
+    /// Poses among them that are claimed.
     pub tracked: u64,
-    /// From the instant that a frame was due to its pose's publication.
+    /// From the time at which a frame was due to the publication of its pose.
     pub latency_ms: Option<Percentiles>,
-    /// From the sending of a frame to the tracker's look at it.
+    /// From the sending of a frame to its pick-up by the tracker.
     pub wake_ms: Option<Percentiles>,
     /// Time in the tracker.
     pub track_ms: Option<Percentiles>,
-    /// Time that the tracker was allowed from a frame's arrival.
+    /// Time allowed to the tracker from a frame's arrival.
     pub deadline_ms: Option<f64>,
     /// Poses published later than that.
     pub deadline_misses: u64,
-    /// Frames without a pose: a newer one had come.
+    /// Frames without a pose, because a newer one had arrived.
     pub dropped: u64,
     /// Page faults of the tracker's frame loop after its first hundred frames.
     pub page_faults: u64,
-    /// Time that the machine below a virtual one took from it meanwhile, all CPUs, milliseconds; null where
-    /// the kernel does not say.
+    /// Time that the host of a virtual machine took from it meanwhile, all CPUs, milliseconds; null where the kernel
+    /// does not report it.
     pub stolen_ms: Option<f64>,
 }
 
-/// Why a trial cannot be made.
+/// Why a trial failed.
 #[derive(Debug, thiserror::Error)]
 pub enum TrialError {
     /// The processes do not run.
@@ -132,18 +132,18 @@ pub enum TrialError {
     /// They ended early.
     #[error("the trial ended early: {0}")]
     Ended(String),
-    /// A signal.
+    /// A signal arrived.
     #[error("interrupted")]
     Interrupted,
-    /// The instance's place is not right.
+    /// The instance's place is invalid.
     #[error(transparent)]
     Place(#[from] PlaceError),
-    /// No thread for the disturbance.
+    /// A thread of the disturbance cannot be started.
     #[error("cannot start a thread for the load ({0})")]
     Thread(std::io::Error),
 }
 
-/// Makes one trial. `source` is repeated; `arguments` are options that every process gets.
+/// Runs one trial. `source` is repeated; `arguments` are options for every process.
 pub fn try_out(
     config: &Config,
     trial: &Trial,
@@ -177,7 +177,7 @@ pub fn try_out(
     }
 }
 
-/// A run of a repeated source under an instance of its own, without results.
+/// A run of a repeated source under a separate instance, without results.
 pub(super) fn bench_options(
     config: &Config,
     num_frames: u64,
@@ -226,7 +226,7 @@ fn measurement(trial: &Trial, outcome: &RunOutcome, stolen_ms: Option<f64>) -> M
 
 /// Time stolen from all CPUs since the machine started, from /proc/stat.
 fn stolen_ms() -> Option<f64> {
-    /// Place of the figure in the line `cpu`, its name counted.
+    /// Index of the figure in the line `cpu`, counting its name.
     const STEAL_FIELD: usize = 8;
     let stat = std::fs::read_to_string("/proc/stat").ok()?;
     let line = stat.lines().find(|line| line.starts_with("cpu "))?;
@@ -234,7 +234,7 @@ fn stolen_ms() -> Option<f64> {
     Some(ticks * 1000.0 / rustix::param::clock_ticks_per_second() as f64)
 }
 
-/// The disturbance while it continues; ends when dropped.
+/// A running disturbance; ends when dropped.
 struct Disturber {
     stop: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
@@ -282,9 +282,9 @@ fn spin(stop: &AtomicBool) {
     }
 }
 
-/// Subscribes as soon as there is somebody, and reads slowly or not at all.
+/// Subscribes as soon as it can, and reads slowly or not at all.
 fn read(place: &Place, hears: bool, stop: &AtomicBool) {
-    // What cannot be waited for is over sooner.
+    // A wait that fails only ends sooner.
     let pause = |time: Duration| drop(wait(&[], None, time));
     let mut opened = None;
     while !stop.load(Ordering::Acquire) {

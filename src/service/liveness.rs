@@ -1,27 +1,27 @@
-//! Whether a process of this machine runs, is stopped, or is there no more, by `/proc`.
+//! Whether a process of this machine runs, is stopped or is gone, from `/proc`.
 
 use std::fs;
 use std::time::Duration;
 
-/// What the kernel says of a process.
+/// State of a process in the kernel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Liveness {
     /// It runs or sleeps.
     Running,
     /// It is stopped by a signal (SIGSTOP, Ctrl-Z) or by a debugger, and does nothing until it is continued.
     Stopped,
-    /// There is no such process, or only its exit code is left.
+    /// No such process exists, or only its exit code is left.
     Gone,
 }
 
 impl Liveness {
-    /// Of the process with this id.
+    /// Liveness of the process with this id.
     pub fn of(process_id: u32) -> Self {
         let stat = fs::read_to_string(format!("/proc/{process_id}/stat")).unwrap_or_default();
         Self::from_stat(&stat)
     }
 
-    /// By the contents of `/proc/ID/stat`.
+    /// From the contents of `/proc/ID/stat`.
     fn from_stat(stat: &str) -> Self {
         let state = field(stat, STATE).and_then(|state| state.chars().next());
         match state {
@@ -32,36 +32,35 @@ impl Liveness {
     }
 }
 
-/// Whether the process with this id was killed or has exited and still gives back what it has: the kernel closes its
-/// files, and with them its locks, when the last of its threads has come to its end.
+/// Whether the process with this id was killed or has exited and still releases its resources: the kernel closes its
+/// files, and with them its locks, when the last of its threads has ended.
 pub fn is_ending(process_id: u32) -> bool {
     ends_by(&fs::read_to_string(format!("/proc/{process_id}/stat")).unwrap_or_default())
 }
 
-/// By the contents of `/proc/ID/stat`.
+/// From the contents of `/proc/ID/stat`.
 fn ends_by(stat: &str) -> bool {
     const FLAGS: usize = 9;
     const NUM_THREADS: usize = 20;
     /// `PF_EXITING` of the kernel.
     const EXITING: u32 = 4;
     let number = |at: usize| field(stat, at).and_then(|of| of.parse::<u32>().ok());
-    // The first thread of a process stays as a zombie until the others are gone, and until somebody asks for its exit
-    // code.
+    // The first thread of a process stays a zombie until the others are gone and until its exit code is collected.
     let is_left =
         field(stat, STATE) == Some("Z") && number(NUM_THREADS).is_none_or(|threads| threads <= 1);
     number(FLAGS).is_some_and(|flags| flags & EXITING != 0) && !is_left
 }
 
-/// Where the state stands in `/proc/ID/stat`, the first field behind the name.
+/// Field of the state in `/proc/ID/stat`, the first after the name.
 const STATE: usize = 3;
 
-/// A field of `/proc/ID/stat`, from the state on, counted from 1 as the kernel's manual does: the name before it may
-/// hold anything.
+/// A field of `/proc/ID/stat`, from the state on, counted from 1 as in the kernel's manual: the name before it may
+/// contain anything.
 fn field(stat: &str, at: usize) -> Option<&str> {
     stat.rsplit_once(')')?.1.split_whitespace().nth(at - STATE)
 }
 
-/// For how long the process with this id has lived; `None` where there is none.
+/// Age of the process with this id; `None` where no such process exists.
 pub fn age(process_id: u32) -> Option<Duration> {
     let stat = fs::read_to_string(format!("/proc/{process_id}/stat")).ok()?;
     let now = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
@@ -70,7 +69,7 @@ pub fn age(process_id: u32) -> Option<Duration> {
     Some(now.saturating_sub(Duration::try_from_secs_f64(began).ok()?))
 }
 
-/// Clock ticks from the start of the machine to that of the process, by the contents of `/proc/ID/stat`.
+/// Clock ticks from the start of the machine to that of the process, from the contents of `/proc/ID/stat`.
 fn began_ticks(stat: &str) -> Option<u64> {
     const START_TIME: usize = 22;
     field(stat, START_TIME)?.parse().ok()
@@ -81,7 +80,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_state_stands_behind_the_name() {
+    fn the_state_follows_the_name() {
         assert_eq!(Liveness::from_stat("7 (a) T b) S 1 7"), Liveness::Running);
         assert_eq!(Liveness::from_stat("7 (semidense) T 1 7"), Liveness::Stopped);
         assert_eq!(Liveness::from_stat("7 (semidense) t 1 7"), Liveness::Stopped);
@@ -91,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn a_process_ends_until_its_last_thread_is_gone() {
+    fn a_process_is_ending_until_its_last_thread_is_gone() {
         let stat = |state: &str, flags: u32, threads: u32| {
             format!("7 (a) b) {state} 1 7 7 0 -1 {flags} 0 0 0 0 0 0 0 0 20 0 {threads} 0 4711 0 0")
         };

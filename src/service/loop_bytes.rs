@@ -1,9 +1,9 @@
 //! The loops of a map as bytes, little-endian, in its manifest and in a checkpoint.
 //!
 //! Layout: number of loops (u64), each: keyframes i and j (u64), `j_from_i` (8 × f64), covariance of its left increment
-//! (upper triangle, 28 × f64); number of keyframes of which it is known against whom they were estimated (u64), each:
-//! keyframe (u64), number (u32) and ids (u64) of the others; number of first keyframes of joined epochs (u64), these (u64);
-//! the last keyframe that was searched (u64, all bits set where there is none).
+//! (upper triangle, 28 × f64); number of keyframes with a record of those they were estimated against (u64), each:
+//! keyframe (u64), number (u32) and ids (u64) of the others; number of first keyframes of joined epochs (u64), these
+//! (u64); the last keyframe that was searched (u64, all bits set where none was).
 
 use zerocopy::{FromBytes, IntoBytes};
 
@@ -23,15 +23,15 @@ const SIDE: usize = 7;
 /// Why loops cannot be used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum LoopBytesError {
-    /// They are cut short, or there is more.
+    /// They are cut short, or followed by other bytes.
     #[error("the loops are cut, or followed by something else")]
     Length,
-    /// A number is not possible.
+    /// A number is invalid.
     #[error("loop {0} is not a measurement between two keyframes")]
     Link(usize),
 }
 
-/// The bytes of some loops.
+/// The bytes of `loops`.
 pub fn loop_bytes(loops: &KnownLoops) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(64 + LINK_BYTES * loops.links.len());
     bytes.extend((loops.links.len() as u64).to_le_bytes());
@@ -52,7 +52,7 @@ pub fn loop_bytes(loops: &KnownLoops) -> Vec<u8> {
     bytes
 }
 
-/// The loops of [`loop_bytes`], every number checked.
+/// Parses [`loop_bytes`] and checks every number.
 pub fn parse_loops(mut bytes: &[u8]) -> Result<KnownLoops, LoopBytesError> {
     let bytes = &mut bytes;
     let mut loops = KnownLoops::default();
@@ -94,7 +94,7 @@ fn take<T: FromBytes>(bytes: &mut &[u8]) -> Result<T, LoopBytesError> {
     bytes::take(bytes).ok_or(LoopBytesError::Length)
 }
 
-/// A number of things of at least so many bytes each: no more than there are bytes for.
+/// Reads a number of items of at least `least` bytes each: no more than the remaining bytes can hold.
 fn count(bytes: &mut &[u8], least: usize) -> Result<usize, LoopBytesError> {
     let count = usize::try_from(take::<u64>(bytes)?).unwrap_or(usize::MAX);
     if count <= bytes.len() / least { Ok(count) } else { Err(LoopBytesError::Length) }
@@ -106,7 +106,7 @@ pub(super) mod tests {
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Sim3;
 
-    /// Two loops, and what else there can be.
+    /// Two loops, and all other parts.
     pub(in crate::service) fn loops() -> KnownLoops {
         let rigid = SE3::exp(&[0.3, -0.2, 0.1, 0.4, 0.5, -0.6].into());
         let mut covariance = Matrix7::identity() * 1e-4;
@@ -121,14 +121,14 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn they_come_back_from_their_bytes() {
+    fn loops_survive_their_bytes() {
         for loops in [loops(), KnownLoops::default()] {
             assert_eq!(parse_loops(&loop_bytes(&loops)), Ok(loops));
         }
     }
 
     #[test]
-    fn every_cut_and_hostile_numbers_are_refused() {
+    fn every_cut_and_invalid_numbers_are_refused() {
         let whole = loop_bytes(&loops());
         for length in 0..whole.len() {
             assert!(parse_loops(&whole[..length]).is_err(), "{length}");

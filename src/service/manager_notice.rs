@@ -1,23 +1,23 @@
-//! What the service manager hears of a process (sd_notify(3)): that it is ready, a line of status, and the
-//! heartbeat of its frame loop. One socket for the life of the process and no allocation: it is used from
-//! the frame loop itself, so that a loop that hangs is not taken for a live one.
+//! Notifications to the service manager (sd_notify(3)): readiness, a status line, and the heartbeat of the frame loop.
+//! One socket for the life of the process and no allocation: the frame loop itself sends them, so that a hanging loop
+//! is not taken for a live one.
 
 use std::fmt;
 use std::io::{self, Cursor, Write};
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixDatagram};
 
-/// Heartbeats in the time that the manager allows between two: two may be lost or late.
+/// Heartbeats within the manager's timeout: two may be lost or late.
 const BEATS_IN_TIMEOUT: i64 = 4;
 /// Longest message: a state, a cause and a few numbers.
 const MESSAGE_BYTES: usize = 512;
-/// By how much a long preparation asks for more time to start, microseconds.
+/// Extension of the start timeout that a long preparation requests, microseconds.
 const START_EXTENSION_US: u64 = 30_000_000;
 
-/// The variables that tell a process of its manager (systemd.exec(5)).
+/// The variables that describe its manager to a process (systemd.exec(5)).
 pub const VARIABLES: [&str; 3] = ["NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"];
 
-/// The manager of this process, where it has one.
+/// The manager of this process, if it has one.
 #[derive(Debug, Default)]
 pub struct ManagerNotice {
     socket: Option<UnixDatagram>,
@@ -33,8 +33,8 @@ struct Heartbeat {
 }
 
 impl Heartbeat {
-    /// `timeout_us` and `process_id` as the manager's variables have them; `None` where it does not watch
-    /// this process.
+    /// `timeout_us` and `process_id` are the values of the manager's variables; `None` where it does not watch this
+    /// process.
     fn of(timeout_us: Option<&str>, process_id: Option<&str>, own_id: u32) -> Option<Self> {
         let timeout_us: i64 = timeout_us?.parse().ok().filter(|&us| us > 0)?;
         let is_meant = process_id.is_none_or(|id| id.parse() == Ok(own_id));
@@ -42,7 +42,7 @@ impl Heartbeat {
         is_meant.then_some(Self { period_nanos, last_nanos: i64::MIN })
     }
 
-    /// Whether it is due; counts from now if it is.
+    /// Whether it is due; if so, counts from now.
     fn is_due(&mut self, now_nanos: i64) -> bool {
         let is_due = now_nanos.saturating_sub(self.last_nanos) >= self.period_nanos;
         if is_due {
@@ -53,8 +53,8 @@ impl Heartbeat {
 }
 
 impl ManagerNotice {
-    /// The manager that the environment names. An invalid name is a warning: the process is wanted
-    /// more than its manager's knowledge of it.
+    /// Connects to the manager that the environment names. An invalid name is a warning: the process matters more than
+    /// its notifications.
     pub fn from_environment() -> Self {
         let variable = |name: &str| std::env::var(name).ok().filter(|value| !value.is_empty());
         let [path, timeout_us, process_id] = VARIABLES.map(variable);
@@ -67,31 +67,31 @@ impl ManagerNotice {
         Self { socket, heartbeat, said_ready: false }
     }
 
-    /// The process does its work from now on. Said once.
+    /// Reports that the process does its work from now on. Sent once.
     pub fn ready(&mut self) {
         if !std::mem::replace(&mut self.said_ready, true) {
             self.send(format_args!("READY=1"));
         }
     }
 
-    /// The process is at its end.
+    /// Reports that the process is ending.
     pub fn stopping(&self) {
         self.send(format_args!("STOPPING=1"));
     }
 
-    /// The preparation continues: until the process is ready the manager waits longer.
+    /// Reports that the preparation continues: until the process is ready the manager waits longer.
     pub fn prepares(&self) {
         if !self.said_ready {
             self.send(format_args!("EXTEND_TIMEOUT_USEC={START_EXTENSION_US}"));
         }
     }
 
-    /// One line for `systemctl status`.
+    /// Sends one line for `systemctl status`.
     pub fn status(&self, status: fmt::Arguments<'_>) {
         self.send(format_args!("STATUS={status}"));
     }
 
-    /// The frame loop is alive. Call it from there, as often as you like.
+    /// Reports that the frame loop is alive. Call it from there, as often as you like.
     pub fn beat(&mut self, now_nanos: i64) {
         if self.heartbeat.as_mut().is_some_and(|heartbeat| heartbeat.is_due(now_nanos)) {
             self.send(format_args!("WATCHDOG=1"));
@@ -101,16 +101,16 @@ impl ManagerNotice {
     fn send(&self, message: fmt::Arguments<'_>) {
         let Some(socket) = &self.socket else { return };
         let mut line = OneLine(Cursor::new([0; MESSAGE_BYTES]));
-        // What does not fit is cut; a manager that is full or gone is none to wait for.
+        // What does not fit is cut; a manager that is full or gone is not waited for.
         let _ = fmt::write(&mut line, message);
         let written = &line.0.get_ref()[..line.0.position() as usize];
-        // Not within a character: the manager takes UTF-8 only.
+        // Not within a character: the manager accepts UTF-8 only.
         let whole = std::str::from_utf8(written).map_or_else(|e| e.valid_up_to(), str::len);
         let _ = socket.send(&written[..whole]);
     }
 }
 
-/// A message whose line ends are blanks: a second line would be another assignment.
+/// A message with its control characters as blanks: a second line would be another assignment.
 struct OneLine(Cursor<[u8; MESSAGE_BYTES]>);
 
 impl fmt::Write for OneLine {
@@ -139,7 +139,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn beats_come_more_often_than_every_half_of_the_timeout() {
+    fn beats_are_due_more_often_than_every_half_timeout() {
         let mut heartbeat = Heartbeat::of(Some("2000000"), Some("17"), 17).unwrap();
         let millis = |ms: i64| ms * 1_000_000;
         assert!(heartbeat.is_due(millis(5)), "the first at once");
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn only_who_is_watched_beats() {
+    fn only_a_watched_process_sends_heartbeats() {
         assert_eq!(Heartbeat::of(None, None, 17), None);
         assert_eq!(Heartbeat::of(Some("0"), None, 17), None);
         assert_eq!(Heartbeat::of(Some("x"), None, 17), None);
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn the_manager_hears_what_is_said() {
+    fn the_manager_receives_every_notice() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("notify");
         let manager = UnixDatagram::bind(&path).unwrap();

@@ -1,13 +1,14 @@
-//! The whole map as a binary file, little-endian: the mapper writes it, supervisor and mapper read
-//! it. Everything read is checked: a broken file gives an error that names what is wrong.
+//! The whole map as a binary file, little-endian: the mapper writes it, supervisor and mapper read it. Everything read
+//! is checked: a corrupt file gives an error that names what is wrong.
 //!
-//! Layout: magic, then the first free epoch (u32), the number of keyframes (u64), then each keyframe: id, revision, sequence
-//! (u64), stamp (i64), epoch, map state, whether its depth is refined (0 or 1), width, height (u32), pose (8 × f64), intrinsics
-//! (4 × f64), covariance of common depth errors (6 × f64) and of the place (28 × f64), number of points (u64), points (u16, u16, 3 × f32), number of image bytes (u64, 0 where the
-//! image was given up), image bytes. Then the number of frames that were aligned again (u64), each: sequence, keyframe
-//! (u64), pose relative to that (7 × f64); and the number of points of the joint estimation (u64), each: keyframe (u64),
-//! u, v (u16), confirmations (u32), inverse depth, brightness (f32). Then bytes of the loops (u64), and these
-//! (`loop_bytes`).
+//! Layout: magic, first free epoch (u32), map revision, active keyframe (all bits set for none), number of keyframes
+//! (u64), then each keyframe: id, revision, map revision, sequence (u64), stamp (i64), epoch, map state, whether its
+//! depth is refined (0 or 1), width, height (u32), poses in the world and in the map (8 × f64 each), intrinsics (4 ×
+//! f64), covariance of common depth errors (6 × f64) and of the pose (28 × f64), number of points (u64), points (u16,
+//! u16, 3 × f32), number of image bytes (u64, 0 without an image), image bytes. Then the number of realigned frames
+//! (u64), each: sequence, keyframe (u64), pose relative to that (7 × f64); the number of points of the joint estimation
+//! (u64), each: keyframe (u64), u, v (u16), confirmations (u32), inverse depth, brightness (f32); bytes of the loops
+//! (u64), and these (`loop_bytes`).
 
 use std::io::{self, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
@@ -31,16 +32,16 @@ use crate::wire::conversion::{
 
 /// First bytes of the file, with the version of the layout.
 const MAGIC: [u8; 16] = *b"semidense map 9\n";
-/// Largest id or revision: what comes after it must not overflow.
+/// Largest id or revision: later ones must not overflow.
 const MAX_NUMBER: u64 = u64::MAX / 2;
-/// Largest number of an epoch, for the same reason.
+/// Largest epoch, for the same reason.
 const MAX_EPOCH: u32 = u32::MAX / 2;
-/// More keyframes than an hour at one each 30 ms: a broken number, not a map.
+/// More keyframes than an hour at one each 30 ms: an invalid number, not a map.
 const MAX_KEYFRAMES: u64 = 120_000;
 
 /// More frames than ten days at 30 Hz.
 const MAX_FRAMES: u64 = 26_000_000;
-/// Points of the joint estimation that the largest map of the largest window has.
+/// Points of the joint estimation in the largest map of the largest window.
 const MAX_CONFIRMED: u64 = MAX_KEYFRAMES * 5000;
 
 /// Why a map cannot be read.
@@ -59,26 +60,26 @@ pub enum MapFault {
     /// They cannot be read, or end too early.
     #[error("{0}; the map is not usable")]
     Read(#[from] io::Error),
-    /// They are something else.
+    /// They are not a map of this version.
     #[error("it is not a map of this version")]
     Magic,
-    /// More than any map has.
+    /// A count exceeds that of any map.
     #[error("{what} = {count} is more than any map has")]
     TooMany {
-        /// Of what.
+        /// What is counted.
         what: &'static str,
-        /// How many.
+        /// The count.
         count: u64,
     },
-    /// A keyframe is broken.
+    /// A keyframe is invalid.
     #[error("keyframe {index}: {source}")]
     Keyframe {
-        /// Its place in the file.
+        /// Its index in the file.
         index: u64,
         /// What is wrong.
         source: MessageError,
     },
-    /// A frame is broken.
+    /// A frame is invalid.
     #[error("frame {sequence}: {source}")]
     Frame {
         /// Its sequence.
@@ -86,16 +87,16 @@ pub enum MapFault {
         /// What is wrong.
         source: MessageError,
     },
-    /// The loops are broken.
+    /// The loops are invalid.
     #[error("loops: {0}")]
     Loops(#[from] LoopBytesError),
-    /// There is more than the map.
+    /// Bytes follow the end of the map.
     #[error("it has bytes after the end of the map")]
     Trailing,
 }
 
-/// Writes `map` under a temporary name and renames it to `path`. `each` is called before each keyframe: a large
-/// map on a slow disk takes longer than a process may be silent.
+/// Writes `map` under a temporary name and renames it to `path`. Calls `each` before each keyframe: a large map on a
+/// slow disk takes longer than a process may be silent.
 pub fn write_map(path: &Path, map: &Map, each: &mut dyn FnMut()) -> io::Result<()> {
     write_atomically(path, |file| {
         write_head(file, map)?;
@@ -141,7 +142,7 @@ fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> 
     file.write_all(&keyframe.image)
 }
 
-/// Frames that were aligned again and points of the joint estimation.
+/// Realigned frames, points of the joint estimation and loops.
 fn write_rest(file: &mut impl Write, map: &Map) -> io::Result<()> {
     file.write_all((map.frames.len() as u64).as_bytes())?;
     for frame in &map.frames {
@@ -184,11 +185,11 @@ pub fn parse_map(bytes: impl Read) -> Result<Map, MapFault> {
     for _ in 0..reader.count("frames", MAX_FRAMES)? {
         map.frames.push(reader.frame()?);
     }
-    // By their sequence a frame is looked up.
+    // Frames are looked up by sequence.
     map.frames.sort_by_key(|frame| frame.sequence);
     for _ in 0..reader.count("points", MAX_CONFIRMED)? {
         let point = reader.confirmed()?;
-        // One without its keyframe has no place.
+        // A point without its keyframe cannot be placed.
         map.confirmed.extend(Some(point).filter(|point| is_placed(&map, point)));
     }
     map.loops = Arc::new(reader.loops()?);
@@ -198,7 +199,7 @@ pub fn parse_map(bytes: impl Read) -> Result<Map, MapFault> {
     }
 }
 
-/// Whether a point lies in the image of its keyframe, at a distance.
+/// Whether a point lies in the image of its keyframe, at a valid depth.
 fn is_placed(map: &Map, point: &ConfirmedPoint) -> bool {
     let is_distance = point.inverse_depth.is_finite() && point.inverse_depth > 0.0;
     is_distance
@@ -217,14 +218,14 @@ pub fn keyframe_bytes(keyframe: &Keyframe) -> Vec<u8> {
     bytes
 }
 
-/// The keyframe of [`keyframe_bytes`], and nothing after it.
+/// Parses [`keyframe_bytes`], with nothing after it.
 pub fn parse_keyframe(bytes: &[u8]) -> Result<Keyframe, MapFault> {
     let mut reader = Reader(bytes);
     let keyframe = reader.keyframe(0)?;
     if reader.0.is_empty() { Ok(keyframe) } else { Err(MapFault::Trailing) }
 }
 
-/// Reads numbers and checks them.
+/// Reads and checks numbers.
 struct Reader<R>(R);
 
 impl<R: Read> Reader<R> {
@@ -319,7 +320,7 @@ impl<R: Read> Reader<R> {
     fn loops(&mut self) -> Result<KnownLoops, MapFault> {
         let count = self.count("loop bytes", MAX_LOOP_BYTES)?;
         let mut bytes = Vec::new();
-        // A broken number asks for no more than there is; what is missing is missed by the parser.
+        // An invalid number reads no more than there is; the parser notices what is missing.
         self.0.by_ref().take(count).read_to_end(&mut bytes)?;
         Ok(parse_loops(&bytes)?)
     }

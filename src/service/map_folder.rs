@@ -1,4 +1,4 @@
-//! The map on disk: a folder that a run begins or continues with, and that the next one finds the camera in.
+//! The map on disk: a folder that a run begins or continues, and in which the next run locates the camera.
 //!
 //! ```text
 //! DIR/manifest           camera, poses, units and covariances of all keyframes, and which file each one's depth is in
@@ -7,13 +7,13 @@
 //! ```
 //!
 //! A file is written under another name, synchronised and renamed; a changed keyframe gets a file of another name, the
-//! manifest that lists it comes after it, and a file is removed when neither manifest lists it. So the folder is a
-//! whole map at every instant: the last that was saved. Every file has a checksum; a keyframe whose file is damaged
-//! keeps its pose and loses its depth, and a damaged manifest costs what was saved last.
+//! manifest that lists it is written after it, and a file is removed once neither manifest lists it. The folder is
+//! therefore a whole map at every instant: the one saved last. Every file has a checksum; a keyframe whose file is
+//! damaged keeps its pose and loses its depth, and a damaged manifest costs the last save.
 //!
-//! It stands beside the checkpoint, which is of an instant and not of a map: the active
-//! keyframe in the middle of its depth, several times a second, in memory, for the one process that comes after. Both,
-//! the journal and the recorder's map write the numbers of a keyframe alike ([`map_file`](crate::service::map_file)).
+//! It is separate from the checkpoint, which records an instant rather than a map: the active keyframe in the middle of
+//! its depth, about once a second, in memory, for the one successor. Both, the journal and the recorder's map write the
+//! numbers of a keyframe alike ([`map_file`](crate::service::map_file)).
 
 pub mod depth_file;
 pub(crate) mod keeper;
@@ -36,7 +36,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;
 use crate::slam::mapper::Mapper;
 
-/// Writes the map of a mapper into a folder that holds none. `each` is called before each keyframe.
+/// Writes the map of a mapper into a folder that holds none. Calls `each` before each keyframe.
 pub fn save_copy(
     folder: &Path,
     mapper: &Mapper,

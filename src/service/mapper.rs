@@ -1,4 +1,4 @@
-//! The mapper process: pairs frames with their poses, lets the map take them in, publishes it.
+//! The mapper process: pairs frames with their poses, adds them to the map, publishes it.
 
 mod commands;
 mod going_over;
@@ -34,14 +34,14 @@ use crate::wire::place::{Claim, Place};
 use crate::wire::port::{Access, Hub, Received, SendError, Subscriber, wait};
 use crate::wire::topic::{FRAME, MAPPER_HEALTH, POSE};
 
-/// Longest sleep without a look at signals and health.
+/// Longest sleep between two checks of signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
-/// What a mapper says of itself before it writes its map, which may take long.
+/// Cause that a mapper reports before it writes its map, which may take long.
 pub const WRITES_MAP: &str = "the map is being written";
 
-/// Runs the process until the signal.
+/// Runs the process until a signal arrives.
 pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), RunError> {
-    // Before the pool is made: its threads run where this one does.
+    // Before the pool is made: its threads inherit the CPUs of this one.
     let refusals = apply(&config.mapper.scheduling);
     refusals.iter().for_each(|refusal| tracing::warn!("mapper: {refusal}"));
     let mut shell = Shell::prepare(config, mode)?;
@@ -51,7 +51,7 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), RunEr
     shell.health.tell_ready();
     let outcome = shell.map_until(shutdown);
     let outcome = outcome.and_then(|()| shell.save_map_folder());
-    // A supervisor that did not ask for the end starts another, which continues from the checkpoint.
+    // A supervisor that did not request the end starts another mapper, which continues from the checkpoint.
     if outcome.is_ok() && !is_supervised() {
         shell.kept.iter_mut().for_each(|kept| kept.end_in_order());
         GoneOver::forget(&shell.place.loaded_map_path());
@@ -71,20 +71,20 @@ struct Shell<'a> {
     order: FrameOrder,
     /// Frames that did not arrive.
     missing: u64,
-    /// CLOCK_MONOTONIC when the last frame arrived.
+    /// CLOCK_MONOTONIC of the arrival of the last frame.
     last_arrival_nanos: Option<i64>,
     commands: Rc<CommandServer>,
     output: Output,
     health: Health,
     mapper: Option<(Intrinsics, Mapper)>,
     adjustments: Adjustments,
-    /// Live: what a successor continues from.
+    /// Live: the checkpoint for a successor.
     kept: Option<Kept>,
-    /// What a mapper that died has left for this one, until the first frame.
+    /// The checkpoint of a mapper that died, until the first frame.
     left: Option<Map>,
     /// The map on disk.
     map: Option<MapSession>,
-    /// The last pose that was claimed.
+    /// The last claimed pose.
     last_pose: Option<PoseEstimate>,
     pool: rayon::ThreadPool,
     hub: Hub,
@@ -98,7 +98,7 @@ impl<'a> Shell<'a> {
         let claim = place.claim("mapper")?;
         let hub = Hub::join(&place, "mapper", Access::Member)?;
         let (kept, left) = match mode {
-            // A run in lockstep ends with any of its processes.
+            // A lockstep run ends with any of its processes.
             Mode::Lockstep => (None, None),
             Mode::Live => Kept::open(&place.checkpoint_path()),
         };
@@ -113,7 +113,7 @@ impl<'a> Shell<'a> {
             mode,
             frames: hub.subscriber(&FRAME)?,
             poses: hub.subscriber(&POSE)?,
-            // One place less than may be borrowed: the next is received before the oldest goes.
+            // One fewer than may be borrowed: the next frame is received before the oldest is released.
             pairing: Pairing::new(FRAME.borrowed - 1),
             order: FrameOrder::default(),
             missing: 0,
@@ -136,7 +136,7 @@ impl<'a> Shell<'a> {
         Ok(shell)
     }
 
-    /// Reads the map on disk, where one is named.
+    /// Reads the map on disk, if one is named.
     fn load_map(&mut self) -> Result<(), RunError> {
         let (configured, max_bytes) = (&self.config.map, self.config.mapping.max_map_bytes());
         let path = self.place.loaded_map_path();
@@ -153,7 +153,7 @@ impl<'a> Shell<'a> {
         Ok(())
     }
 
-    /// Writes what the map on disk does not have yet.
+    /// Writes what the map on disk lacks.
     fn save_map_folder(&mut self) -> Result<(), RunError> {
         let (Some(map), Some((_, mapper))) = (&mut self.map, &self.mapper) else { return Ok(()) };
         let health = &mut self.health;
@@ -169,7 +169,7 @@ impl<'a> Shell<'a> {
             self.pick_up_adjustment()?;
             while let Some((frame, pose)) = self.next_pair()? {
                 self.step(&frame, &pose)?;
-                // A map that is behind has no pause between its steps.
+                // A map that lags behind has no pause between its steps.
                 self.answer_commands()?;
                 self.output.serve_late_joiners();
                 if shutdown.is_requested() {
@@ -183,7 +183,7 @@ impl<'a> Shell<'a> {
         Ok(())
     }
 
-    /// The oldest frame with its pose, of those that are still here.
+    /// The oldest frame with its pose, among those still held.
     fn next_pair(&mut self) -> Result<Option<(Frame, PoseEstimate)>, RunError> {
         while let Some(frame) = self.frames.receive()? {
             self.take_in(frame);
@@ -201,8 +201,7 @@ impl<'a> Shell<'a> {
         Ok(self.pairing.take())
     }
 
-    /// A frame that is whole and comes in its turn waits for its pose; counts what is not and what is
-    /// missing.
+    /// Holds a valid frame that arrives in order until its pose arrives; counts invalid and missing frames.
     fn take_in(&mut self, frame: Frame) {
         let header = *frame.header();
         if let Err(error) = frame_from_message(&header, frame.payload()) {
@@ -225,7 +224,7 @@ impl<'a> Shell<'a> {
         }
     }
 
-    /// Live: says it when frames have stopped coming. The next step ends the state.
+    /// Live: reports when frames have stopped. The next step ends the state.
     fn look_for_silence(&mut self) {
         let periods = self.config.tracker.stale_periods;
         if self.mode == Mode::Live && self.order.is_silent(self.last_arrival_nanos, periods) {
@@ -233,9 +232,9 @@ impl<'a> Shell<'a> {
         }
     }
 
-    /// One frame into the map, and what changed out to the others.
+    /// Adds one frame to the map and publishes what changed.
     fn step(&mut self, received: &Frame, pose: &PoseEstimate) -> Result<(), RunError> {
-        // Checked when it was taken in.
+        // Checked on arrival.
         let Ok((frame, intrinsics)) = frame_from_message(received.header(), received.payload())
         else {
             return Ok(());
@@ -258,7 +257,7 @@ impl<'a> Shell<'a> {
         }
         tracing::trace_span!("publish").in_scope(|| self.output.publish(mapper, &outcome))?;
         let change_nanos = change.filter(|_| outcome.keyframe_created).map_or(0, nanos_since);
-        // The tracker has the keyframe; the rest it gets as another revision.
+        // The tracker has the keyframe; the rest reaches it as another revision.
         let finished = tracing::trace_span!("finish_keyframe")
             .in_scope(|| self.pool.install(|| mapper.finish_keyframe()));
         let step_nanos = nanos_since(begin);
@@ -277,14 +276,14 @@ impl<'a> Shell<'a> {
         Ok(())
     }
 
-    /// Whether there is a mapper for frames of this camera; makes one where it is another than before.
+    /// Whether there is a mapper for frames of this camera; makes one where the camera has changed.
     fn suits_camera(&mut self, intrinsics: Intrinsics) -> Result<bool, RunError> {
         if self.mapper.as_ref().is_some_and(|(of, _)| *of == intrinsics) {
             return Ok(true);
         }
         match self.change_camera(intrinsics) {
             Err(RunError::Parameter(_, error)) => {
-                // The configuration was checked at the start: it is the image that is too small.
+                // The configuration was checked at the start, so the image is too small.
                 self.health.counters().refused += 1;
                 self.health.enter(ProcessState::Running, &error.to_string());
                 Ok(false)
@@ -293,7 +292,7 @@ impl<'a> Shell<'a> {
         }
     }
 
-    /// Takes changes of the map into the checkpoint and into the map on disk.
+    /// Writes changes of the map to the checkpoint and to the map on disk.
     fn follow(&mut self, outcomes: &[&StepOutcome]) {
         let Some((_, mapper)) = &mut self.mapper else { return };
         if let Some(kept) = &mut self.kept {
@@ -304,7 +303,7 @@ impl<'a> Shell<'a> {
         }
     }
 
-    /// Tells what the map holds after a step, and what the step took.
+    /// Reports the contents of the map after a step, and the duration of the step.
     fn tell_step(&mut self, step_nanos: u64) {
         let Some((_, mapper)) = &self.mapper else { return };
         let counters = self.health.counters();
@@ -314,12 +313,12 @@ impl<'a> Shell<'a> {
         counters.detail = mapper.keyframe().map_or(0, |k| code_from_map_state(k.map_state));
         self.health.count_work(step_nanos);
         self.health.count_latency(step_nanos);
-        // A report that goes out at once has the step in it.
+        // A report sent at once includes the step.
         self.health.enter(ProcessState::Running, &mapper.situation().to_string());
         self.health.report();
     }
 
-    /// Live: a joint estimate that is ready enters the map, and goes out, though no frame comes.
+    /// Live: lets a finished joint estimate into the map and publishes it, although no frame arrives.
     fn pick_up_adjustment(&mut self) -> Result<(), RunError> {
         let Some((_, mapper)) = &mut self.mapper else { return Ok(()) };
         let outcome = self.adjustments.pick_up(mapper);
@@ -329,8 +328,8 @@ impl<'a> Shell<'a> {
         Ok(())
     }
 
-    /// A mapper for another camera: the first, which continues from what a dead one has left, or one in
-    /// mid-stream, which begins an epoch.
+    /// Makes a mapper for another camera: the first, which continues from what a dead one left, or one in mid-stream,
+    /// which begins an epoch.
     fn change_camera(&mut self, intrinsics: Intrinsics) -> Result<(), RunError> {
         let mut mapper = Mapper::new(intrinsics, self.config.mapping.clone())
             .map_err(|error| RunError::Parameter("mapping", error))?;
@@ -358,7 +357,7 @@ impl<'a> Shell<'a> {
     }
 }
 
-/// Publishes and counts joint estimates that are over; says it when there will be no more.
+/// Publishes and counts finished joint estimates; reports when there will be no more.
 fn tell_adjustments(
     adjustments: &mut Adjustments,
     output: &Output,
@@ -376,7 +375,7 @@ fn tell_adjustments(
     Ok(())
 }
 
-/// Logs a loop that was closed and epochs that were joined.
+/// Logs closed loops and joined epochs.
 fn tell_search(report: &SearchReport) {
     let (keyframe, other) = (report.keyframe_id, report.other.unwrap_or(NO_KEYFRAME));
     match report.fate {
@@ -392,18 +391,18 @@ fn tell_search(report: &SearchReport) {
     }
 }
 
-/// The joint estimation of keyframes, as the mode wants it.
+/// Starts the joint estimation of keyframes as the mode requires.
 fn start_adjustments(config: &Config, mode: Mode) -> Result<Adjustments, RunError> {
     let delay = Entry::AfterFrames(config.mapping.window.delay_frames as u64);
     let started = match mode {
-        // The frames wait for it.
+        // Frames wait for it.
         Mode::Lockstep => Adjustments::start(delay, Background::Other),
         Mode::Live => Adjustments::start(Entry::WhenReady, config.mapper.background),
     };
     started.map_err(|error| RunError::Thread("estimates keyframes jointly", error))
 }
 
-/// Time since an instant of CLOCK_MONOTONIC.
+/// Nanoseconds since an instant of CLOCK_MONOTONIC.
 fn nanos_since(begin: i64) -> u64 {
     u64::try_from(now_nanos() - begin).unwrap_or(0)
 }

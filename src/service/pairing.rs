@@ -1,13 +1,13 @@
-//! Brings frames and their poses together by sequence.
+//! Pairs frames and poses by sequence.
 
 use std::collections::VecDeque;
 
 use crate::slam::pose::PoseEstimate;
 
-/// Poses kept while their frame is missing: half a second at 60 Hz, far more than a frame is late.
+/// Poses kept while their frame is missing: half a second at 60 Hz, far longer than a frame is late.
 const MAX_POSES: usize = 32;
 
-/// Frames and poses that wait for each other. `F` is a frame as it lies in shared memory.
+/// Frames and poses that wait for each other. `F` is a frame in shared memory.
 #[derive(Debug)]
 pub struct Pairing<F> {
     frames: VecDeque<(u64, F)>,
@@ -23,14 +23,14 @@ impl<F> Pairing<F> {
         Self { frames, poses, max_frames, dropped: 0 }
     }
 
-    /// The source counts anew: what waits belongs to the time before.
+    /// The source has restarted its numbering: drops everything that waits.
     pub fn restart(&mut self) {
         self.dropped += self.frames.len() as u64;
         self.frames.clear();
         self.poses.clear();
     }
 
-    /// A frame came, later than all before; the oldest goes where there are too many.
+    /// Adds a frame, later than all before; drops the oldest where there are too many.
     pub fn push_frame(&mut self, sequence: u64, frame: F) {
         if self.frames.len() == self.max_frames {
             self.frames.pop_front();
@@ -39,7 +39,7 @@ impl<F> Pairing<F> {
         self.frames.push_back((sequence, frame));
     }
 
-    /// A pose came: in its turn or, from a tracker that has died, late or once more.
+    /// Adds a pose: in order or, from a tracker that has died, late or repeated.
     pub fn push_pose(&mut self, pose: PoseEstimate) {
         let place = self.poses.partition_point(|known| known.sequence < pose.sequence);
         if self.poses.get(place).is_some_and(|known| known.sequence == pose.sequence) {
@@ -51,7 +51,7 @@ impl<F> Pairing<F> {
         }
     }
 
-    /// The oldest pair. Frames before it will get no pose any more and are let go.
+    /// Takes the oldest pair. Frames before it will get no pose and are dropped.
     pub fn take(&mut self) -> Option<(F, PoseEstimate)> {
         while let Some(pose) = self.poses.front() {
             let (oldest, _) = self.frames.front()?;
@@ -70,7 +70,7 @@ impl<F> Pairing<F> {
         None
     }
 
-    /// Frames that were let go without a pose since the start.
+    /// Frames dropped without a pose since the start.
     pub fn dropped(&self) -> u64 {
         self.dropped
     }
@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn either_may_come_first() {
+    fn either_may_arrive_first() {
         let mut pairing = Pairing::new(3);
         pairing.push_pose(pose(0));
         assert_eq!(take(&mut pairing), None);
@@ -103,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_tracker_skipped_is_let_go() {
+    fn frames_the_tracker_skipped_are_dropped() {
         let mut pairing = Pairing::new(3);
         for (sequence, frame) in [(0, 'a'), (1, 'b'), (2, 'c')] {
             pairing.push_frame(sequence, frame);
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn a_source_that_starts_again_does_not_block() {
+    fn a_restarted_source_does_not_block() {
         let mut pairing = Pairing::new(3);
         pairing.push_pose(pose(500));
         pairing.push_frame(501, 'x');
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn late_and_repeated_poses_cost_no_pair() {
+    fn late_and_repeated_poses_lose_no_pair() {
         let mut pairing = Pairing::new(3);
         for (sequence, frame) in [(4, 'a'), (5, 'b'), (6, 'c')] {
             pairing.push_frame(sequence, frame);
@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_of_a_frame_that_never_comes_does_not_block_those_before_it() {
+    fn a_pose_whose_frame_never_arrives_does_not_block_earlier_ones() {
         let mut pairing = Pairing::new(3);
         pairing.push_pose(pose(u64::MAX));
         for sequence in 0..100 {

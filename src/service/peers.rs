@@ -1,4 +1,4 @@
-//! What a process knows of the others: their last health.
+//! The last health of the other processes.
 
 use crate::service::health::ProcessState;
 use crate::wire::message::HealthMessage;
@@ -14,7 +14,7 @@ pub struct Peer {
 }
 
 impl Peer {
-    /// Listens to `topic`; what was said last comes too.
+    /// Subscribes to `topic`; the last message published is received too.
     pub fn open(hub: &Hub, topic: &Topic) -> Result<Self, OpenError> {
         Ok(Self { topic: *topic, subscriber: hub.subscriber(topic)?, last: None })
     }
@@ -24,7 +24,7 @@ impl Peer {
         self.topic.owner
     }
 
-    /// Takes in what came, and gives the last word.
+    /// Takes in what has arrived and returns the last message.
     pub fn update(&mut self) -> Result<Option<&HealthMessage>, ReceiveError> {
         while let Some(message) = self.subscriber.receive()? {
             self.last = message.payload().first().copied().or(self.last);
@@ -32,17 +32,17 @@ impl Peer {
         Ok(self.last.as_ref())
     }
 
-    /// The last word.
+    /// The last message.
     pub fn last(&self) -> Option<&HealthMessage> {
         self.last.as_ref()
     }
 
-    /// Forgets it: the process was started again.
+    /// Forgets it, as the process was restarted.
     pub fn forget(&mut self) {
         self.last = None;
     }
 
-    /// Its state by the last word.
+    /// Its state in the last message.
     pub fn state(&self) -> Option<ProcessState> {
         ProcessState::from_code(self.last.as_ref()?.state)
     }

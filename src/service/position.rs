@@ -1,5 +1,5 @@
-//! Where capture stands in its source, in a small file of the runtime folder: whoever takes the place of a
-//! capture that was killed continues behind its last frame, whatever else died with it.
+//! The position of capture in its source, in a small file of the runtime folder: the successor of a killed capture
+//! continues after its last frame, whatever else died with it.
 
 use std::fs::{self, File, OpenOptions};
 use std::io;
@@ -11,16 +11,16 @@ use zerocopy::IntoBytes;
 use crate::capture::source::FrameStamp;
 use crate::service::mode::Mode;
 
-/// Environment variable by which a supervisor names its run, so that the file of an earlier one is not taken.
+/// Environment variable in which a supervisor names its run, so that the file of an earlier run is not used.
 pub const RUN_VARIABLE: &str = "SEMIDENSE_RUN";
 
 /// Numbers of a slot: key, count of writes, process, sequence, stamp, frames, gaps, and their checksum.
 const SLOT_NUMBERS: usize = 8;
 const SLOT_BYTES: usize = 8 * SLOT_NUMBERS;
-/// Written in turn: a write that is cut short leaves the one before.
+/// Written alternately: a write that is cut short leaves the previous one.
 const SLOTS: u64 = 2;
 
-/// The last frame of a capture and what it had counted.
+/// The last frame of a capture and its counts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Position {
     /// The capture process.
@@ -29,16 +29,16 @@ pub struct Position {
     pub sequence: u64,
     /// Its stamp, nanoseconds of the source's clock.
     pub capture_nanos: i64,
-    /// Frames that this process has sent, with this one.
+    /// Frames that this process has sent, including this one.
     pub frames: u64,
-    /// Holes in the source's sequence that it has met.
+    /// Gaps in the source's sequence so far.
     pub gaps: u64,
 }
 
-/// Frames in a row that may be no newer than the last one of the capture before: a second at 30 Hz.
+/// Frames in a row that may be no newer than the last one of the previous capture: a second at 30 Hz.
 const MAX_FRAMES_BEHIND: u32 = 30;
 
-/// What the frames of a file belong to: a run and its source. FNV-1a, 64 bits.
+/// Key of a file's frames: their run and its source. FNV-1a, 64 bits.
 pub fn position_key(run: &str, source: &str, rig: Option<&Path>) -> u64 {
     let rig = rig.map_or(&b""[..], |rig| rig.as_os_str().as_encoded_bytes());
     // A byte that none of them contains keeps "ab" + "c" from "a" + "bc".
@@ -53,22 +53,22 @@ fn hash<'a>(bytes: impl IntoIterator<Item = &'a u8>) -> u64 {
 }
 
 impl Position {
-    /// Of this process at a frame.
+    /// The position of this process at a frame.
     pub fn at(stamp: &FrameStamp, frames: u64, gaps: u64) -> Self {
         let (process_id, sequence) = (std::process::id(), stamp.sequence);
         Self { process_id, sequence, capture_nanos: stamp.capture_nanos, frames, gaps }
     }
 }
 
-/// Keeps the position of this process, where it can be kept: without a file capture works too.
+/// Keeps the position of this process where it can: capture works without a file too.
 #[derive(Debug, Default)]
 pub struct PositionKeeper {
     file: Option<PositionFile>,
 }
 
 impl PositionKeeper {
-    /// Keeps the place in `source` in the file at `path`, and gives where a capture of the same run has died. In
-    /// lockstep nothing is kept: such a run ends with any of its processes.
+    /// Keeps the position in `source` in the file at `path`, and returns where a capture of the same run died. Nothing
+    /// is kept in lockstep: such a run ends with any of its processes.
     pub fn of_run(
         path: &Path,
         mode: Mode,
@@ -90,7 +90,7 @@ impl PositionKeeper {
         }
     }
 
-    /// Writes the position of a frame that is about to be sent. A file that refuses is said once.
+    /// Writes the position of a frame that is about to be sent. A failure is logged once.
     pub fn note_or_warn(&mut self, position: &Position) {
         if let Some(Err(error)) = self.file.as_mut().map(|file| file.note(position)) {
             tracing::warn!("the position in the source is not saved any more ({error})");
@@ -98,7 +98,7 @@ impl PositionKeeper {
         }
     }
 
-    /// Nobody continues from here: the file is removed when this is dropped.
+    /// No capture continues from here: the file is removed on drop.
     pub fn end_in_order(&mut self) {
         self.file.iter_mut().for_each(PositionFile::end_in_order);
     }
@@ -107,7 +107,7 @@ impl PositionKeeper {
 /// Stamp of a frame of a camera without a clock.
 const NO_STAMP: i64 = 0;
 
-/// How far the capture before had come, until the first frame behind it.
+/// Progress of the previous capture, until the first frame after it.
 #[derive(Debug, Default)]
 pub struct Predecessor {
     /// Stamp of its last frame.
@@ -116,8 +116,8 @@ pub struct Predecessor {
 }
 
 impl Predecessor {
-    /// Whether a frame is no newer than its last. A source that gives only such frames has another clock by
-    /// now, or none at all.
+    /// Whether a frame is no newer than its last one. A source that gives only such frames has another clock by now, or
+    /// none.
     pub fn is_ahead_of(&mut self, stamp: &FrameStamp) -> bool {
         if stamp.capture_nanos == NO_STAMP {
             self.last_nanos = None;
@@ -131,7 +131,7 @@ impl Predecessor {
     }
 }
 
-/// The file. It stays unless the process ends in order.
+/// The position file. It stays unless the process ends in order.
 #[derive(Debug)]
 struct PositionFile {
     path: PathBuf,
@@ -149,7 +149,7 @@ impl PositionFile {
         let file = options.open(path)?;
         let left = newest_slot(&file, key);
         if left.is_none() {
-            // Room for both slots is there from now on: writing a position cannot run out of it.
+            // Reserves room for both slots, so that writing a position cannot run out of it.
             file.write_all_at(&[0; SLOT_BYTES * SLOTS as usize], 0)?;
         }
         let writes = left.map_or(0, |(writes, _)| writes);
@@ -177,7 +177,7 @@ impl Drop for PositionFile {
     }
 }
 
-/// The position in the file at `path`; `None` where there is none of this key.
+/// Reads the position in the file at `path`; `None` where it has none with this key.
 pub fn read_position(path: &Path, key: u64) -> Option<Position> {
     newest_slot(&File::open(path).ok()?, key).map(|(_, position)| position)
 }
@@ -190,7 +190,7 @@ fn slot_bytes(key: u64, writes: u64, position: &Position) -> [u8; SLOT_BYTES] {
     zerocopy::transmute!(slot)
 }
 
-/// The slot that was written last of those that are whole and of this key.
+/// The slot written last among those that are intact and have this key.
 fn newest_slot(file: &File, key: u64) -> Option<(u64, Position)> {
     let read = |slot: u64| {
         let mut numbers = [0; SLOT_NUMBERS];
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn the_last_position_is_found_again_and_only_by_its_own_run() {
+    fn the_last_position_is_found_only_by_its_own_run() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rig.position");
         let key = position_key("run 1", "sim", None);
@@ -230,7 +230,7 @@ mod tests {
             keeper.note(&position(sequence)).unwrap();
             assert_eq!(read_position(&path, key), Some(position(sequence)));
         }
-        // A kill runs no destructor; without the word this is the same.
+        // A kill runs no destructor; a drop without `end_in_order` is equivalent.
         drop(keeper);
         let (mut next, left) = PositionFile::open(&path, key).unwrap();
         assert_eq!(left, Some(position(4)));
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_before_the_last_one_are_left_out_where_there_is_a_clock() {
+    fn frames_before_the_last_one_are_left_out_if_the_source_has_a_clock() {
         let at = |capture_nanos| FrameStamp {
             sequence: 0,
             capture_nanos,
@@ -273,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn a_torn_write_leaves_the_position_before() {
+    fn a_torn_write_leaves_the_previous_position() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rig.position");
         let (mut keeper, _) = PositionFile::open(&path, 3).unwrap();

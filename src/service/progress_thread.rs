@@ -1,5 +1,5 @@
-//! Hands the progress of a run to a thread that shows it, so that the run never waits for a terminal that is stopped
-//! or a pipe that nobody reads.
+//! Hands the progress of a run to a thread that shows it, so that the run never waits for a stopped terminal or for a
+//! pipe without a reader.
 
 use std::io;
 use std::sync::Arc;
@@ -12,17 +12,17 @@ use crossbeam::queue::ArrayQueue;
 use crate::service::clock::wait_at_most;
 use crate::service::run_progress::RunProgress;
 
-/// How long the end waits for the thread.
+/// Longest wait for the thread at the end.
 const LONGEST_FINISH: Duration = Duration::from_secs(1);
 
-/// The thread and what it is handed.
+/// The thread and its input.
 #[derive(Debug)]
 pub struct ProgressThread {
     thread: JoinHandle<()>,
     handed: Arc<Handed>,
 }
 
-/// The newest replaces what was not shown yet.
+/// The newest progress replaces one that was not shown yet.
 #[derive(Debug)]
 struct Handed {
     newest: ArrayQueue<RunProgress>,
@@ -30,7 +30,7 @@ struct Handed {
 }
 
 impl ProgressThread {
-    /// Starts it with what shows progress; `None` is the end.
+    /// Starts it with a function that shows progress; `None` is the end.
     pub fn start(mut show: impl FnMut(Option<&RunProgress>) + Send + 'static) -> io::Result<Self> {
         let newest = ArrayQueue::new(1);
         let handed = Arc::new(Handed { newest, is_over: AtomicBool::new(false) });
@@ -48,13 +48,13 @@ impl ProgressThread {
         Ok(Self { thread, handed })
     }
 
-    /// Hands over how far it is, without waiting.
+    /// Hands over the progress, without waiting.
     pub fn show(&self, progress: &RunProgress) {
         self.handed.newest.force_push(progress.clone());
         self.thread.thread().unpark();
     }
 
-    /// Ends it; one that cannot write is not waited for.
+    /// Ends it; waits at most a second for a thread that cannot write.
     pub fn finish(self) {
         self.handed.is_over.store(true, Ordering::Release);
         self.thread.thread().unpark();

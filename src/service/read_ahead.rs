@@ -1,4 +1,4 @@
-//! Frames of a recording are read and decoded on a thread of their own, a few ahead of who takes them.
+//! Reads and decodes the frames of a recording on a separate thread, a few ahead of their consumer.
 
 use std::thread::Scope;
 
@@ -8,18 +8,18 @@ use crate::capture::source::{FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
 use crate::slam::image::buffer::Image;
 
-/// Frames that are read before they are asked for. One is enough while decoding is faster than mapping; the others
-/// bridge the frames that take long.
+/// Frames that are read before they are requested. One is enough while decoding is faster than mapping; the others
+/// bridge frames that take long.
 const MOST_AHEAD: usize = 3;
 
-/// What is read, and until when.
+/// What to read, and until when.
 #[derive(Debug, Clone, Copy)]
 pub struct ReadingPlan {
-    /// Frames after which nothing more is read.
+    /// Frames after which reading ends.
     pub max_frames: usize,
     /// Whether the depth camera's images are read too.
     pub with_depth: bool,
-    /// Whether the first image that cannot be used is the last that is read.
+    /// Whether reading ends with the first unusable image.
     pub is_strict: bool,
 }
 
@@ -30,11 +30,11 @@ pub struct ReadFrame {
     pub stamp: Result<Option<FrameStamp>, SourceError>,
     /// Its `width * height` pixels.
     pub pixels: Vec<u8>,
-    /// The depth camera's image, where it was asked for and there is one.
+    /// The depth camera's image, where it was requested and exists.
     pub sensor_depth: Result<Option<Image<f32>>, SourceError>,
 }
 
-/// Frames in their order, as they were read.
+/// Frames in order, as they were read.
 #[derive(Debug)]
 pub struct ReadAhead {
     frames: Receiver<ReadFrame>,
@@ -42,7 +42,7 @@ pub struct ReadAhead {
 }
 
 impl ReadAhead {
-    /// Starts to read `source` on a thread of `scope`, which ends when this is dropped.
+    /// Starts reading `source` on a thread of `scope`, which ends when this is dropped.
     pub fn start<'scope>(
         scope: &'scope Scope<'scope, '_>,
         source: &'scope mut dyn FrameSource,
@@ -50,10 +50,10 @@ impl ReadAhead {
     ) -> std::io::Result<Self> {
         let camera = source.intrinsics();
         let (to_taker, frames) = bounded(MOST_AHEAD);
-        // One more is with who takes them.
+        // One more is held by the consumer.
         let (spare, memory) = bounded(MOST_AHEAD + 1);
         for _ in 0..MOST_AHEAD + 1 {
-            // Its other end is held here.
+            // Cannot fail: the receiver is held here.
             let _ = spare.send(vec![0; camera.width * camera.height]);
         }
         std::thread::Builder::new()
@@ -62,19 +62,19 @@ impl ReadAhead {
         Ok(Self { frames, spare })
     }
 
-    /// The next frame; `None` where no more are read.
+    /// The next frame; `None` after the last one read.
     pub fn next(&self) -> Option<ReadFrame> {
         self.frames.recv().ok()
     }
 
     /// Takes back the memory of a frame.
     pub fn give_back(&self, pixels: Vec<u8>) {
-        // The thread may have ended, and then needs none.
+        // The thread may have ended and then needs none.
         let _ = self.spare.try_send(pixels);
     }
 }
 
-/// Reads until the end, an error that is one for good, or until nobody takes frames any more.
+/// Reads until the end, until a permanent error, or until the consumer is gone.
 fn read(
     source: &mut dyn FrameSource,
     plan: ReadingPlan,

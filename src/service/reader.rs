@@ -1,4 +1,4 @@
-//! Reads the topics of an instance, whenever it runs: waits for it, notices its end, and joins the next one.
+//! Reads the topics of an instance whenever it runs: waits for it, notices its end, and joins the next one.
 //!
 //! ```no_run
 //! use std::time::Duration;
@@ -18,9 +18,9 @@
 //! # }
 //! ```
 //!
-//! Messages are checked where they come in; broken ones are counted and left out. A [`Session`] stays on the thread that
-//! opened it; what it gives is owned and may be sent to others. Who wants the bytes where they lie, without a copy, opens
-//! single topics with [`crate::wire::port::Hub`].
+//! Messages are checked on arrival; invalid ones are counted and left out. A [`Session`] stays on the thread that
+//! opened it; its events own their data and may be sent to other threads. To read the bytes in place, without a copy,
+//! open single topics with [`crate::wire::port::Hub`].
 
 use std::os::fd::BorrowedFd;
 use std::sync::Arc;
@@ -41,15 +41,15 @@ use crate::wire::port::{
 };
 use crate::wire::topic::{ADJUSTMENT, FRAME, GRAPH, HEALTH_TOPICS, POSE};
 
-/// An instance that has said nothing for so long is not there any more: processes report once a second.
+/// Silence after which an instance counts as gone: processes report once a second.
 const LONGEST_SILENCE: Duration = Duration::from_secs(3);
-/// Time between two attempts to join an instance that is not there yet.
+/// Time between two attempts to join an instance that does not run yet.
 const RETRY_PERIOD: Duration = Duration::from_millis(250);
 
-/// Which topics are read besides poses and health.
+/// Topics to read besides poses and health.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Wants {
-    /// Images of the camera; the newest wins where they are not taken in time.
+    /// Images of the camera; the newest wins where they are not received in time.
     pub frames: bool,
     /// Keyframes: image and depth of the active one, and each revision of its depth.
     pub keyframes: bool,
@@ -70,12 +70,12 @@ pub struct Frame {
     pub pixels: Arc<[u8]>,
 }
 
-/// A pose, checked, with the message it came in.
+/// A pose, checked, with its message.
 #[derive(Debug, Clone, Copy)]
 pub struct Pose {
-    /// As it was sent: stamps and timing.
+    /// The message as sent: stamps and timing.
     pub message: PoseMessage,
-    /// What it says.
+    /// The pose in it.
     pub estimate: PoseEstimate,
 }
 
@@ -84,14 +84,14 @@ pub struct Pose {
 pub struct Graph {
     /// Epoch and revision.
     pub header: GraphHeader,
-    /// One for each keyframe.
+    /// One per keyframe.
     pub poses: Vec<KeyframePose>,
 }
 
-/// What comes out of shared memory.
+/// An event from shared memory.
 #[derive(Debug, Clone)]
 pub enum Event {
-    /// An instance was joined: what came before belongs to another run.
+    /// An instance was joined: earlier events belong to another run.
     Joined,
     /// The instance is gone; the session waits for the next one.
     Left,
@@ -112,7 +112,7 @@ pub enum Event {
 /// Why reading failed.
 #[derive(Debug, thiserror::Error)]
 pub enum SessionError {
-    /// The instance cannot be joined, and waiting does not help.
+    /// The instance cannot be joined, and waiting will not help.
     #[error(transparent)]
     Open(#[from] OpenError),
     /// Waiting failed.
@@ -120,7 +120,7 @@ pub enum SessionError {
     Wait(#[from] WaitError),
 }
 
-/// Topics of one instance.
+/// The topics of one instance.
 #[derive(Debug)]
 pub struct Session {
     place: Place,
@@ -133,13 +133,13 @@ pub struct Session {
 }
 
 impl Session {
-    /// A session with the instance at `place` under the process name `name`; joins it when it is there.
+    /// A session with the instance at `place` under the process name `name`; joins it once it runs.
     pub fn new(place: Place, name: &str, wants: Wants) -> Self {
         let name = name.to_owned();
         Self { place, name, wants, ports: None, tried: None, heard: Instant::now(), refused: 0 }
     }
 
-    /// The same, but an error where the instance does not run now.
+    /// As [`Self::new`], but returns an error where the instance does not run now.
     pub fn join(place: Place, name: &str, wants: Wants) -> Result<Self, OpenError> {
         let ports = Ports::open(&place, name, wants)?;
         let mut session = Self::new(place, name, wants);
@@ -147,18 +147,18 @@ impl Session {
         Ok(session)
     }
 
-    /// Whether an instance is there.
+    /// Whether an instance is joined.
     pub fn is_joined(&self) -> bool {
         self.ports.is_some()
     }
 
-    /// Broken messages that were left out.
+    /// Invalid messages that were left out.
     pub fn refused(&self) -> u64 {
         self.refused
     }
 
-    /// Waits for messages, until `interrupt` is readable, or for `timeout` at most, and gives what came to `take`, in the
-    /// order of each topic. An error is final.
+    /// Waits for messages until `interrupt` is readable or `timeout` has passed, and passes those that arrived to
+    /// `take`, in the order of each topic. An error is final.
     pub fn read(
         &mut self,
         interrupt: Option<BorrowedFd<'_>>,
@@ -188,7 +188,7 @@ impl Session {
         Ok(())
     }
 
-    /// An instance that is not there, or is only starting, is tried again; one of another version never fits.
+    /// Retries an instance that is absent or only starting; one of another version never fits.
     fn try_to_join(&mut self, take: &mut impl FnMut(Event)) -> Result<(), SessionError> {
         if self.tried.is_some_and(|tried| tried.elapsed() < RETRY_PERIOD) {
             return Ok(());
@@ -240,7 +240,7 @@ impl Ports {
         })
     }
 
-    /// What wakes a wait: poses and, where they are read, frames and keyframes. The rest comes with these, or once a second.
+    /// Events that wake a wait: poses and, if read, frames and keyframes. The rest is read along, or once a second.
     fn events(&self) -> Vec<&Events> {
         let frames = self.frames.as_ref().map(Subscriber::events);
         let keyframes = self.keyframes.as_ref().map(KeyframeInbox::events);

@@ -12,23 +12,23 @@ use crate::wire::message::{AdjustmentMessage, PoseMessage, StepMessage};
 use crate::wire::port::{Events, Hub, OpenError, ReceiveError, Subscriber};
 use crate::wire::topic::{ADJUSTMENT, POSE, STEP};
 
-/// Poses and steps as they come in.
+/// Poses and steps as they arrive.
 #[derive(Debug)]
 pub struct Recorder {
     poses: Subscriber<PoseMessage, ()>,
     steps: Subscriber<StepMessage, ()>,
     adjustments: Subscriber<AdjustmentMessage, ()>,
-    /// What was collected so far.
+    /// Collected so far.
     pub recording: Recording,
-    /// What the mapper said last.
+    /// The last step of the mapper.
     pub last_step: Option<StepMessage>,
     journal: Option<Journal>,
-    /// What only the journal needs; none without one, and after it has failed.
+    /// Needed by the journal alone; `None` without one, and after it has failed.
     keyframes: Option<KeyframeFeed>,
 }
 
 impl Recorder {
-    /// Listens from now on; what comes goes into the journal too, where there is one.
+    /// Subscribes from now on; messages go into the journal too, if there is one.
     pub fn open(hub: &Hub, journal: Option<Journal>) -> Result<Self, OpenError> {
         let keyframes = journal.is_some().then(|| KeyframeFeed::open(hub)).transpose()?;
         Ok(Self {
@@ -47,7 +47,7 @@ impl Recorder {
         self.poses.events()
     }
 
-    /// Takes in everything that came; whether that was anything.
+    /// Takes in everything that has arrived; returns whether anything had.
     pub fn collect(&mut self) -> Result<bool, ReceiveError> {
         let before = self.recording.num_poses() + self.recording.num_steps();
         while let Some(message) = self.poses.receive()? {
@@ -81,7 +81,7 @@ impl Recorder {
         Ok(self.recording.num_poses() + self.recording.num_steps() > before)
     }
 
-    /// Gives the journal the keyframes that came. Without them the run continues, and what is left of it after
+    /// Gives the journal the keyframes that have arrived. Without them the run continues, and what is left of it after
     /// a kill has no depth: worth a warning, not the end of a run.
     fn collect_keyframes(&mut self, is_end: bool) {
         let (Some(journal), Some(keyframes)) = (&mut self.journal, &mut self.keyframes) else {
@@ -99,20 +99,20 @@ impl Recorder {
         }
     }
 
-    /// Whether what was counted is due in the journal.
+    /// Whether the counters are due in the journal.
     pub fn wants_counters(&self) -> bool {
         self.journal.as_ref().is_some_and(Journal::wants_counters)
     }
 
-    /// Keeps what was counted until now.
+    /// Writes the counters so far to the journal.
     pub fn count(&mut self, counters: RunCounters) {
         if let Some(journal) = &mut self.journal {
             journal.count(counters);
         }
     }
 
-    /// Completes the map of a mapper that has died on the way, or that gave none, with what the journal
-    /// kept: at most `max_bytes` of depth.
+    /// Completes the map of a mapper that died during the run, or that provided none, from the journal, with at most
+    /// `max_bytes` of depth.
     pub fn complete_map(&mut self, map: &mut Map, max_bytes: u64) {
         self.collect_keyframes(true);
         if let Some(journal) = &mut self.journal {
@@ -121,7 +121,7 @@ impl Recorder {
         }
     }
 
-    /// Takes back the poses that only the journal has; how many cannot be read, which are lost.
+    /// Takes back the poses that only the journal has; returns how many cannot be read and are lost.
     pub fn take_back(&mut self) -> usize {
         let num_released = self.recording.num_released();
         let Some(journal) = self.journal.as_ref().filter(|_| num_released > 0) else { return 0 };
@@ -133,7 +133,7 @@ impl Recorder {
         missing
     }
 
-    /// The record of the whole run, after [`Recorder::take_back`], and its journal with all of it.
+    /// The record of the whole run, after [`Recorder::take_back`], and its complete journal.
     pub fn into_record(mut self, parts: RecordParts) -> (RunRecord, Option<Journal>) {
         self.count(parts.counters);
         self.collect_keyframes(true);

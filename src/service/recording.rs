@@ -1,4 +1,4 @@
-//! What is collected of a run while it continues: poses, times and counts, until they are a record.
+//! Poses, times and counts collected during a run, until they become a record.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,17 +12,17 @@ use crate::slam::trajectory::StampedPose;
 use crate::wire::conversion::{MessageError, pose_from_message, start_frame_from_code};
 use crate::wire::message::PoseMessage;
 
-/// What only the supervisor knows of a run.
+/// Counts of a run that only the supervisor has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct RunCounters {
     /// Frames that capture sent.
     pub frames_in: u64,
-    /// Images that the source could not give.
+    /// Images that the source could not deliver.
     pub frames_refused: u64,
-    /// Holes in the source's sequence.
+    /// Gaps in the source's sequence.
     pub gaps: u64,
-    /// Processes that were started again.
+    /// Processes that were restarted.
     pub restarts: u64,
     /// Frames published after the deadline.
     pub deadline_misses: u64,
@@ -30,12 +30,12 @@ pub struct RunCounters {
     pub page_faults: u64,
     /// Largest resident memory of all processes together, bytes.
     pub peak_rss_bytes: u64,
-    /// Live: how late capture sent frames after their stamp.
+    /// Live: how long after its stamp capture sent each frame.
     pub send_counts: TimeCounts,
 }
 
 impl RunCounters {
-    /// Adds what one process has counted of frames.
+    /// Adds the frame counts of one process.
     pub fn add(&mut self, counted: &Self) {
         self.frames_in += counted.frames_in;
         self.frames_refused += counted.frames_refused;
@@ -49,7 +49,7 @@ impl RunCounters {
 /// Poses and steps of a run so far.
 #[derive(Debug, Default)]
 pub struct Recording {
-    /// The newest; those before them were released.
+    /// The newest; earlier ones were released.
     poses: Vec<RecordedPose>,
     num_released: usize,
     /// State of the last frame.
@@ -63,24 +63,24 @@ pub struct Recording {
     span_nanos: Option<(i64, i64)>,
 }
 
-/// What a record is made of besides what was collected.
+/// Parts of a record besides those collected.
 #[derive(Debug)]
 pub struct RecordParts {
     /// How the run was driven.
     pub mode: RunMode,
-    /// Where the frames came from.
+    /// Source of the frames.
     pub source: String,
     /// The map at the end.
     pub map: Map,
     /// True poses.
     pub ground_truth: Vec<StampedPose>,
-    /// Where metres come from when depth is compared.
+    /// Source of the metric scale when depth is compared.
     pub depth_scale: DepthScale,
     /// Whether keyframes took their first depth from the source's depth camera.
     pub is_depth_from_sensor: bool,
-    /// The tracker's deadline as it is configured, milliseconds.
+    /// The tracker's configured deadline, milliseconds.
     pub deadline_ms: f64,
-    /// What was counted.
+    /// The counters.
     pub counters: RunCounters,
 }
 
@@ -97,15 +97,15 @@ impl Recording {
         Ok(())
     }
 
-    /// Forgets the first `num_kept` poses of the run, which are kept elsewhere: a kilobyte each.
+    /// Drops the first `num_kept` poses of the run, which are kept elsewhere: a kilobyte each.
     pub fn release(&mut self, num_kept: usize) {
-        /// Room for so many is not given back.
+        /// Capacity for this many is not given back.
         const SPARE: usize = 256;
         let count = num_kept.saturating_sub(self.num_released).min(self.poses.len());
         if count > 0 {
             self.poses.drain(..count);
             self.num_released += count;
-            // After a disk that was full for long.
+            // After the disk was full for long.
             self.poses.shrink_to(2 * self.poses.len() + SPARE);
         }
     }
@@ -115,10 +115,10 @@ impl Recording {
         self.num_released
     }
 
-    /// Takes back what was released, as `read` gives it, in order; how many poses are missing for good.
+    /// Takes back the released poses, which `read` gives in order; returns how many are lost.
     pub fn take_back(&mut self, read: impl FnOnce(&mut dyn FnMut(&PoseMessage))) -> usize {
         let mut poses = Vec::with_capacity(self.num_poses());
-        // They could be read when they came.
+        // They were valid when they arrived.
         read(&mut |message| poses.extend(recorded(message)));
         let missing = self.num_released.saturating_sub(poses.len());
         poses.append(&mut self.poses);
@@ -126,8 +126,8 @@ impl Recording {
         missing
     }
 
-    /// Takes in a step of the mapper: what it took, `change_nanos` 0 where no keyframe was made, and the
-    /// code of what the frame came to in a start.
+    /// Takes in a step of the mapper: its duration, `change_nanos` (0 where no keyframe was made), and the code of the
+    /// frame's outcome in a start.
     pub fn take_step(&mut self, step_nanos: u64, change_nanos: u64, start_frame: u32) {
         self.start.count(start_frame_from_code(start_frame));
         self.map_nanos.push(step_nanos);
@@ -137,7 +137,7 @@ impl Recording {
         }
     }
 
-    /// Takes in a joint estimate of keyframes that is over.
+    /// Takes in a finished joint estimate of keyframes.
     pub fn take_adjustment(&mut self, adjustment: AdjustmentRecord) {
         self.adjustments.push(adjustment);
     }
@@ -152,7 +152,7 @@ impl Recording {
         self.map_nanos.len()
     }
 
-    /// The record of the whole run, of which nothing is released any more.
+    /// The record of the whole run, once all released poses have been taken back.
     pub fn into_record(mut self, parts: RecordParts) -> RunRecord {
         let counters = &parts.counters;
         let stamps = |pose: Option<&RecordedPose>| pose.map_or(0, |p| p.estimate.capture_nanos);
@@ -168,7 +168,7 @@ impl Recording {
         let (is_live, is_replay) = (parts.mode == RunMode::Live, parts.mode == RunMode::Replay);
         let wall_nanos = self.span_nanos.map_or(0, |(first, last)| last.saturating_sub(first));
         if is_replay {
-            // One process: nothing was sent.
+            // A single process sends nothing.
             self.poses.iter_mut().for_each(|p| (p.latency_nanos, p.wake_nanos) = (None, None));
         }
         if parts.depth_scale == DepthScale::Given {
@@ -222,7 +222,7 @@ mod tests {
     use crate::slam::pose::PoseEstimate;
     use crate::wire::conversion::{PoseTiming, pose_message};
 
-    /// Of frame `sequence`, every figure its own.
+    /// The message of frame `sequence`, every figure distinct.
     fn message(sequence: u64) -> PoseMessage {
         let frame = FrameView {
             sequence,
@@ -242,14 +242,14 @@ mod tests {
     }
 
     #[test]
-    fn poses_that_are_released_and_taken_back_make_the_same_record() {
+    fn released_and_taken_back_poses_give_the_same_record() {
         let messages: Vec<PoseMessage> = (0..900).map(message).collect();
         let (mut whole, mut released) = (Recording::default(), Recording::default());
         for (number, message) in messages.iter().enumerate() {
             whole.take_pose(message).unwrap();
             released.take_pose(message).unwrap();
             if number % 7 == 0 {
-                // Of what is not there nothing is released.
+                // Only existing poses are released.
                 released.release(if number > 800 { 2000 } else { number / 2 });
             }
             assert_eq!(released.num_poses(), number + 1);

@@ -1,5 +1,5 @@
-//! Where the tracker gets its references: prepared on the spot in lockstep, so that the result is
-//! the same on every run; on a second thread live, so that the frame loop only swaps a pointer.
+//! The tracker's source of references: prepared on the spot in lockstep, so that the result is the same in every run;
+//! on a second thread live, so that the frame loop only swaps a pointer.
 
 use std::io;
 use std::sync::Arc;
@@ -19,15 +19,15 @@ use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub, OpenError, Subscriber, wait};
 use crate::wire::topic::STEP;
 
-/// Longest sleep of the second thread without a look at its end.
+/// Longest sleep of the second thread between two checks for its end.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
-/// Used references whose memory waits for the next: one in use, one prepared, one being made.
+/// Used references whose memory is kept for the next: one in use, one prepared, one in preparation.
 const MAX_USED: usize = 3;
 
-/// The last pose that was claimed, as the mapper knows it.
+/// The last claimed pose, according to the mapper.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LastPose {
-    /// Life of the map.
+    /// Epoch of the map.
     pub epoch: u32,
     /// Stamp of its frame, nanoseconds.
     pub nanos: i64,
@@ -36,7 +36,7 @@ pub struct LastPose {
 }
 
 impl LastPose {
-    /// The pose of a step; `None` where it names none, or none that can be.
+    /// The pose in a step; `None` where it has none, or an invalid one.
     fn of(step: &StepMessage) -> Option<Self> {
         let world_from_camera = rigid_from_message(&step.world_from_camera, "world_from_camera");
         let (epoch, nanos) = (step.epoch, step.pose_nanos);
@@ -45,30 +45,30 @@ impl LastPose {
     }
 }
 
-/// Gives the newest keyframe, prepared.
+/// Provides the newest keyframe, prepared.
 #[derive(Debug)]
 pub enum ReferenceFeed {
-    /// Prepares when asked.
+    /// Prepares on request.
     Synchronous(Box<Synchronous>),
-    /// Prepares beside the frame loop.
+    /// Prepares alongside the frame loop.
     Threaded(Preparer),
 }
 
 impl ReferenceFeed {
-    /// Prepares when asked.
+    /// Prepares on request.
     pub fn synchronous(hub: &Hub, params: &ReferenceParams) -> Result<Self, OpenError> {
         let (inbox, params) = (KeyframeInbox::open(hub)?, params.clone());
         let scratch = ReferenceScratch::default();
         Ok(Self::Synchronous(Box::new(Synchronous { inbox, params, used: None, scratch })))
     }
 
-    /// Prepares on a thread of its own, which joins the instance by itself.
+    /// Prepares on a separate thread, which joins the instance separately.
     pub fn threaded(place: &Place, params: &ReferenceParams) -> io::Result<Self> {
         Ok(Self::Threaded(Preparer::start(place, params)?))
     }
 
-    /// Live: where the map has heard of the camera last, with the first reference of a tracker that is
-    /// started again. Said once.
+    /// Live: the last camera pose in the mapper's steps, with the first reference of a restarted tracker. Returned
+    /// once.
     pub fn last_pose(&self) -> Option<LastPose> {
         match self {
             Self::Threaded(preparer) => preparer.shared.last_pose.pop(),
@@ -76,7 +76,7 @@ impl ReferenceFeed {
         }
     }
 
-    /// The newest reference that has not been taken.
+    /// The newest reference that was not taken yet.
     pub fn newest(&mut self) -> Result<Option<Box<Reference>>, InboxError> {
         match self {
             Self::Threaded(preparer) => Ok(preparer.shared.prepared.pop()),
@@ -99,14 +99,14 @@ impl ReferenceFeed {
         match self {
             Self::Synchronous(synchronous) => synchronous.used = Some(used),
             Self::Threaded(preparer) => {
-                // A full queue gives it back to us, and it is freed here.
+                // A full queue returns it, and it is freed here.
                 let _ = preparer.shared.used.push(used);
             }
         }
     }
 }
 
-/// A reference of `keyframe`, in the memory of a used one where there is one.
+/// A reference of `keyframe`, in the memory of a used one if there is one.
 fn prepare(
     keyframe: &Keyframe,
     used: Option<Box<Reference>>,
@@ -170,7 +170,7 @@ impl Drop for Preparer {
 
 type Opened = (KeyframeInbox, Subscriber<StepMessage, ()>, Hub);
 
-/// Opens the ports, again and again: a tracker without keyframes is of no use. `None` at the end.
+/// Opens the ports, with retries: a tracker without keyframes is of no use. `None` once stopped.
 fn open_until_stopped(place: &Place, shared: &Shared) -> Option<Opened> {
     let open = || -> Result<Opened, OpenError> {
         let hub = Hub::join(place, "tracker-reference", Access::Member)?;
@@ -186,7 +186,7 @@ fn open_until_stopped(place: &Place, shared: &Shared) -> Option<Opened> {
                 said.news(&error).inspect(|news| tracing::error!("no keyframes yet: {news}"));
             }
         }
-        // A pause; where it cannot be waited the next attempt comes sooner.
+        // A pause; if waiting fails, the next attempt is only sooner.
         drop(wait(&[], None, WAKE_PERIOD));
     }
     None
@@ -194,7 +194,7 @@ fn open_until_stopped(place: &Place, shared: &Shared) -> Option<Opened> {
 
 fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Shared) {
     let Some((mut inbox, steps, _hub)) = open_until_stopped(place, shared) else { return };
-    // Until the first keyframe. Here and not in the frame loop: it maps memory of the mapper's.
+    // Until the first keyframe. Here and not in the frame loop, as it maps memory of the mapper.
     let mut steps: Option<Subscriber<StepMessage, ()>> = Some(steps);
     let mut said = SaidOnce::default();
     let mut scratch = ReferenceScratch::default();
@@ -207,7 +207,7 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
             Ok(None) => {}
             Ok(Some(keyframe)) => {
                 said = SaidOnce::default();
-                // What the tracker has not taken yet is older: it goes.
+                // A reference that the tracker has not taken yet is older: its memory is reused.
                 let reference = prepare(&keyframe, shared.used.pop(), params, &mut scratch);
                 if let Some(last) = steps.take().and_then(|steps| last_pose(&steps)) {
                     shared.last_pose.force_push(last);
@@ -223,12 +223,12 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
     }
 }
 
-/// Keeps an error that comes again and again from filling the log.
+/// Keeps a recurring error from filling the log.
 #[derive(Debug, Default)]
 struct SaidOnce(String);
 
 impl SaidOnce {
-    /// The text of an error that is another than the last.
+    /// The text of an error that differs from the last.
     fn news(&mut self, error: &dyn std::error::Error) -> Option<String> {
         let text = error.to_string();
         (text != self.0).then(|| self.0.clone_from(&text))?;
@@ -247,7 +247,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_error_is_said_once_for_each_change() {
+    fn an_error_is_reported_once_per_change() {
         let error = |text: &str| io::Error::other(text.to_owned());
         let mut said = SaidOnce::default();
         let news: Vec<_> =

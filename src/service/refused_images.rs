@@ -2,23 +2,23 @@
 
 use crate::capture::source_error::SourceError;
 
-/// Images that are named one by one; of more only the number is told.
+/// Images that are named; beyond that only their number is reported.
 const MAX_NAMED: usize = 10;
 
 /// The images that a run leaves out.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RefusedImages {
     count: u64,
-    /// The first of them: which, and why.
+    /// The first of them: which image, and why.
     reasons: Vec<String>,
-    /// Reasons that have been logged.
+    /// Reasons logged so far.
     logged: usize,
     has_good_image: bool,
 }
 
 impl RefusedImages {
-    /// An image was left out for this reason. It is logged once a good one has shown that the
-    /// recording as a whole is usable; where none is, the reason becomes the error.
+    /// Counts an image left out for this reason. It is logged once a good one has shown that the recording as a whole
+    /// is usable; without a good one, the reason becomes the error.
     pub fn refuse(&mut self, error: &SourceError) {
         self.count += 1;
         if self.reasons.len() < MAX_NAMED {
@@ -27,7 +27,7 @@ impl RefusedImages {
         self.log();
     }
 
-    /// A good image came.
+    /// Notes a good image.
     pub fn accept(&mut self) {
         if !self.has_good_image {
             self.has_good_image = true;
@@ -53,14 +53,13 @@ impl RefusedImages {
         self.count
     }
 
-    /// The error of a source that has ended without one good image; `None` where there was one, or
-    /// nothing was left out.
+    /// The error of a source that ended without one good image; `None` where there was one, or nothing was left out.
     pub fn error(&self) -> Option<SourceError> {
         let first = self.reasons.first().filter(|_| !self.has_good_image)?;
         Some(SourceError::AllDamaged { count: self.count, first: first.clone() })
     }
 
-    /// What was left out in a few words; `None` where nothing was.
+    /// A short text on the images left out; `None` where none were.
     pub fn text(&self) -> Option<String> {
         let first = self.reasons.first()?;
         Some(format!("{} left out, the first: {first}", self.count))

@@ -1,4 +1,4 @@
-//! Frames of a replay aligned again with fewer iterations: what a deadline would have cost.
+//! Realigns frames of a replay with fewer iterations: what a deadline would have cost.
 
 use std::time::Instant;
 
@@ -8,16 +8,16 @@ use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::tracker::{Memory, Tracker};
 
-/// Frames from one that is aligned again to the next, at least: a twentieth of a replay's time.
+/// Fewest frames from one realigned frame to the next: a twentieth of a replay's time.
 const LEAST_INTERVAL: usize = 10;
 
-/// Frames of a sequence that are aligned again, at most: enough for a percentile.
+/// Most realigned frames of a sequence: enough for a percentile.
 const MOST_FRAMES: usize = 60;
 
-/// Every so many points are enough for a mean.
+/// One point in this many is enough for a mean.
 const POINT_STRIDE: usize = 8;
 
-/// Aligns frames again, spread over a sequence.
+/// Realigns frames spread over a sequence.
 #[derive(Debug)]
 pub struct Rehearsal {
     interval: usize,
@@ -27,14 +27,14 @@ pub struct Rehearsal {
 }
 
 impl Rehearsal {
-    /// For a sequence of `total` frames, where that is known.
+    /// For a sequence of `total` frames, if that is known.
     pub fn new(total: Option<usize>) -> Self {
         let interval = total.map_or(0, |total| total.div_ceil(MOST_FRAMES)).max(LEAST_INTERVAL);
         Self { interval, frames: 0, samples: Vec::new(), nanos: 0 }
     }
 
-    /// Aligns `frame` again where its turn has come. `memory` is what `tracker` remembered before it tracked the
-    /// frame; the tracker stays as it is.
+    /// Realigns `frame` when it is due. `memory` is that of `tracker` before it tracked the frame; the tracker is
+    /// unchanged.
     pub fn observe(&mut self, tracker: &mut Tracker, memory: &Memory, frame: &FrameView<'_>) {
         self.frames += 1;
         if !self.frames.is_multiple_of(self.interval) || self.samples.len() >= MOST_FRAMES {
@@ -45,13 +45,13 @@ impl Rehearsal {
         self.nanos += elapsed_nanos(begin);
     }
 
-    /// The frames that were aligned again, and the time that it took.
+    /// The realigned frames, and the time they took.
     pub fn into_samples(self) -> (Vec<BudgetSample>, u64) {
         (self.samples, self.nanos)
     }
 }
 
-/// One frame with growing budgets; `None` where it is not tracked.
+/// Aligns one frame with growing budgets; `None` where it is not tracked.
 fn rehearse(tracker: &mut Tracker, memory: &Memory, frame: &FrameView<'_>) -> Option<BudgetSample> {
     let mut attempt = |budget: u32| {
         let (begin, mut used) = (Instant::now(), 0);
@@ -81,7 +81,7 @@ fn rehearse(tracker: &mut Tracker, memory: &Memory, frame: &FrameView<'_>) -> Op
         displacement_px: mean_displacement_px(reference, &pose, &best, POINT_STRIDE),
     };
     let last = BudgetStep { iterations: needed, nanos, displacement_px: 0.0 };
-    // A frame that is cut short takes a last look at the finest level: less may take longer than more.
+    // A frame that is cut short is evaluated once more on the finest level: less may take longer than more.
     Some(attempts.into_iter().map(step).chain([last]).collect())
 }
 

@@ -1,9 +1,9 @@
-//! The whole recipe in one process: every frame, in order.
+//! The whole pipeline in one process: every frame, in order.
 //!
-//! Frame N: track, map, and if the keyframe changed prepare it and give it to the tracker, where it
-//! is active from frame N+1 on. Keyframes are estimated jointly beside that, on a thread of its own, and the
-//! estimate enters a fixed number of frames later. Lockstep runs do the same over shared memory and give the same
-//! bits; times are measured here, around the calls.
+//! Frame N: track, map, and if the keyframe changed prepare it and give it to the tracker, where it is active from
+//! frame N+1 on. Meanwhile keyframes are estimated jointly on a separate thread, and the estimate enters a fixed number
+//! of frames later. Lockstep runs do the same over shared memory and give the same bits; times are measured here,
+//! around the calls.
 
 use std::time::Instant;
 
@@ -58,38 +58,38 @@ pub enum DepthOrigin {
 /// What to replay and how.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ReplayConfig {
-    /// Tuning of the tracker.
+    /// Parameters of the tracker.
     pub tracker: TrackerParams,
-    /// Tuning of the mapper.
+    /// Parameters of the mapper.
     pub mapper: MapperParams,
-    /// The map on disk that it begins or continues.
+    /// The map on disk that the replay begins or continues.
     pub map: MapConfig,
     /// Where poses come from.
     pub poses: PoseOrigin,
     /// Where the first depth comes from.
     pub initial_depth: DepthOrigin,
-    /// Stop after as many frames; `None` for all.
+    /// Stop after this many frames; `None` for all.
     pub max_frames: Option<usize>,
-    /// An image that cannot be used ends the replay; otherwise it is left out and counted.
+    /// Whether an unusable image ends the replay; otherwise it is left out and counted.
     pub strict: bool,
 }
 
-/// A frame that is done, for whoever watches.
+/// Progress after a frame, for an observer.
 #[derive(Debug, Clone, Copy)]
 pub struct ReplayProgress<'a> {
     /// Frames done.
     pub done: usize,
-    /// Frames there will be, where that is known.
+    /// Frames in all, if that is known.
     pub total: Option<usize>,
     /// State of the frame just done.
     pub state: TrackingState,
-    /// What the mapper made of it.
+    /// The mapper's outcome for it.
     pub outcome: StepOutcome,
-    /// Everything until now, but for the map.
+    /// Everything so far, except the map.
     pub record: &'a RunRecord,
-    /// The map until now.
+    /// The map so far.
     pub map: &'a Map,
-    /// What the frame came to in a start.
+    /// The frame's outcome in a start.
     pub start_frame: Option<StartFrame>,
     /// The active keyframe.
     pub keyframe: Option<&'a Keyframe>,
@@ -98,13 +98,13 @@ pub struct ReplayProgress<'a> {
 /// Why a sequence cannot be replayed.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
-    /// The source gave no frame, or a broken one.
+    /// The source gave no frame, or an invalid one.
     #[error(transparent)]
     Source(#[from] SourceError),
-    /// The source failed later; what came before is whole.
+    /// The source failed later; the frames before are complete.
     #[error("{cause}; the results are of the {} frames before", record.frames_in)]
     Cut {
-        /// Everything until then.
+        /// Everything up to then.
         record: Box<RunRecord>,
         /// Why it ended.
         cause: SourceError,
@@ -115,39 +115,39 @@ pub enum ReplayError {
     /// The map could not be saved at the end.
     #[error("{cause}")]
     Unsaved {
-        /// Everything that was done.
+        /// Everything up to then.
         record: Box<RunRecord>,
-        /// Why.
+        /// The cause.
         cause: MapSessionError,
     },
-    /// No thread.
+    /// A thread cannot be started.
     #[error(
         "cannot start a thread of the replay ({0}): end other programs or raise the limit of processes (ulimit -u)"
     )]
     Thread(std::io::Error),
-    /// A parameter out of its range.
+    /// A parameter is out of range.
     #[error("configuration: {0}")]
     Parameter(#[from] ParameterError),
     /// The source ended before its first frame.
     #[error("{0} has no frames: check the path and the list of images")]
     Empty(String),
-    /// The source's size and intrinsics are no camera's.
+    /// The source's size and intrinsics are not those of a camera.
     #[error("{0} has unusable intrinsics: check its camera file or rig")]
     Intrinsics(String),
-    /// Poses were to be given, but there are none.
+    /// Poses were to be given, but the source has none.
     #[error(
         "{0} has no ground-truth poses: leave out '--poses groundtruth' or add groundtruth.txt"
     )]
     NoGroundTruth(String),
-    /// Depth was to come from a sensor, but there is none.
+    /// Depth was to come from a sensor, but the source has none.
     #[error(
         "{0} has no depth images at its first frame: leave out '--initial-depth sensor' or add depth.txt"
     )]
     NoSensorDepth(String),
 }
 
-/// Replays `source` (named `source_name` in messages and results). `observe` is called after each
-/// frame and returns false to end early; what was done until then is recorded.
+/// Replays `source` (named `source_name` in messages and results). `observe` is called after each frame and returns
+/// false to end early; everything up to then is recorded.
 pub fn replay(
     source: &mut dyn FrameSource,
     source_name: &str,
@@ -179,18 +179,18 @@ pub fn replay(
     }
 }
 
-/// Frames there will be, where that is known.
+/// Frames in all, if that is known.
 fn frames_to_come(source: &dyn FrameSource, config: &ReplayConfig) -> Option<usize> {
     source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)))
 }
 
-/// The depth camera's image of a frame, where there is one.
+/// The depth camera's image of a frame, if there is one.
 type SensorDepth = Result<Option<Image<f32>>, SourceError>;
 
-/// Whether the map is on the disk at the end.
+/// Whether the map is on disk at the end.
 type Saved = Result<(), MapSessionError>;
 
-/// A replay under way.
+/// A replay in progress.
 struct Replay<'a> {
     config: &'a ReplayConfig,
     width: usize,
@@ -198,10 +198,10 @@ struct Replay<'a> {
     tracker: Tracker,
     mapper: Mapper,
     map: Option<MapSession>,
-    /// Poses to be given, the first camera's frame as the world; made at the first frame.
+    /// Given poses, with the first camera as the world; made at the first frame.
     given_poses: Vec<StampedPose>,
     rehearsal: Rehearsal,
-    /// Memory of the reference that the tracker gave back.
+    /// Memory of the reference that the tracker returned.
     spare: Option<Box<Reference>>,
     record: RunRecord,
     adjustments: Adjustments,
@@ -225,7 +225,7 @@ impl<'a> Replay<'a> {
         }
         let mut mapping = config.mapper.clone();
         if given {
-            // Poses that are given are not estimated.
+            // Given poses are not estimated.
             mapping.window.num_free = 0;
         }
         let mut mapper = Mapper::new(intrinsics, mapping)?;
@@ -261,7 +261,7 @@ impl<'a> Replay<'a> {
         })
     }
 
-    /// All frames; what ended them where they did not come to their end.
+    /// Replays all frames; returns the error that ended them early, if any.
     fn run(
         &mut self,
         frames: &ReadAhead,
@@ -297,7 +297,7 @@ impl<'a> Replay<'a> {
         Ok(None)
     }
 
-    /// One frame: track, map, hand the keyframe on.
+    /// One frame: track, map, pass the keyframe on.
     fn step(
         &mut self,
         stamp: &FrameStamp,
@@ -346,7 +346,7 @@ impl<'a> Replay<'a> {
         Ok((pose.state, outcome))
     }
 
-    /// Lets the joint estimate of keyframes in that is due with this frame, and hands over what is new.
+    /// Lets in the joint estimate of keyframes that is due with this frame, and hands over what is new.
     fn adjust(&mut self, sequence: u64, outcome: &mut StepOutcome) {
         let entered = self.adjustments.after_frame(&mut self.mapper, sequence);
         outcome.keyframe_changed |= entered.keyframe_changed;
@@ -373,7 +373,7 @@ impl<'a> Replay<'a> {
         Ok(sensor_depth)
     }
 
-    /// Gives the tracker the mapper's keyframe, in the memory of the one before.
+    /// Gives the tracker the mapper's keyframe, in the memory of the previous one.
     fn hand_on_keyframe(&mut self) {
         let Some(keyframe) = self.mapper.keyframe() else { return };
         let new = || Box::new(Reference::new(self.config.tracker.reference.clone()));
@@ -436,7 +436,7 @@ impl<'a> Replay<'a> {
         self.stamps = Some((first, *stamp));
     }
 
-    /// An image was left out: its place in the sequence stays empty, which is no gap.
+    /// Leaves an image out: its place in the sequence stays empty, which is not a gap.
     fn leave_out(&mut self) {
         if let Some((_, last)) = &mut self.stamps {
             last.sequence = last.sequence.saturating_add(1);

@@ -60,21 +60,21 @@ use crate::slam::trajectory::StampedPose;
 pub use crate::service::results::budget_curve::BudgetSample;
 pub use crate::service::results::summary::Summary;
 
-/// What of the map is written and how it is judged.
+/// Which parts of the map are written, and how a run is evaluated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ResultsParams {
-    /// Largest σ/d of a point that is written or shown. 0.1: a point that is known to a tenth of its distance; larger
+    /// Largest σ/d of a point that is written or shown. 0.1: a standard deviation of a tenth of the distance; larger
     /// values keep more points and more outliers.
     pub max_relative_std_dev: f64,
     /// Distance between the points of `map.ply`: a length in map units (`"0.02"`), or a share of the distance from the
     /// camera (`"0.5%"`), so that near surfaces are finer; nowhere below the points' standard deviation.
     pub map_resolution: MapResolution,
-    /// Write `map.pcd` too: the points of `map.ply` for PCL.
+    /// Also write `map.pcd`: the points of `map.ply` for PCL.
     pub pcd: bool,
-    /// Write `points-full.ply` too: every point of every keyframe, before fusion.
+    /// Also write `points-full.ply`: every point of every keyframe, before fusion.
     pub full_points: bool,
-    /// What is fitted before positions are compared with the ground truth: `sim3`, `se3` or `none`.
+    /// Transform fitted before positions are compared with the ground truth: `sim3`, `se3` or `none`.
     pub alignment: TrajectoryAlignment,
 }
 
@@ -96,7 +96,7 @@ impl ResultsParams {
         check_range("max_relative_std_dev", self.max_relative_std_dev, 0.0..=10.0)
     }
 
-    /// How keyframes are fused to one surface.
+    /// Parameters for fusing keyframes into one surface.
     pub fn fusion(&self) -> FusionParams {
         FusionParams {
             resolution: self.map_resolution,
@@ -106,7 +106,7 @@ impl ResultsParams {
     }
 }
 
-/// The figures of a run and what they are made of.
+/// The figures of a run and the data behind them.
 pub struct Results<'a> {
     /// The figures.
     pub summary: Summary,
@@ -120,20 +120,20 @@ pub struct Results<'a> {
 }
 
 impl<'a> Results<'a> {
-    /// Evaluates a run. True depth comes from `depth_source` where it has any. `progress` is called with how many keyframes
-    /// are fused, of how many.
+    /// Evaluates a run. True depth comes from `depth_source` where it has any. Calls `progress` with the number of
+    /// keyframes fused so far, and of all.
     pub fn new(
         record: &'a RunRecord,
         depth_source: &mut dyn FrameSource,
         params: &'a ResultsParams,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, ResultsError> {
-        // Files hold every epoch; figures and pictures are of the longest.
+        // Files hold every epoch; figures and pictures show the longest.
         let epoch = poses::longest_epoch(record);
         let trajectory = poses::of_epoch(&poses::final_poses(record), epoch);
         let online = poses::online_trajectory(record, epoch);
         let evaluate = |estimate: &[StampedPose]| {
-            // Poses that were given have no error.
+            // Given poses have no error.
             let given = record.depth_scale == DepthScale::Given;
             let truth = if given { &[][..] } else { &record.ground_truth };
             evaluate_trajectory(estimate, truth, params.alignment, MAX_DIFFERENCE_NANOS).ok()
@@ -171,9 +171,9 @@ impl<'a> Results<'a> {
     }
 
     /// Writes `trajectory.txt`, `trajectory_online.txt`, `keyframes.txt`, `map.ply`, `points.ply`, `summary.json`,
-    /// `report.html`, and on request `map.pcd` and `points-full.ply` into `dir`, which [`output_folder::prepare_output`] has made: all of
-    /// them, in the place of an earlier run's, or none. `write_more` writes what belongs to the set
-    /// besides, into the folder that it is given.
+    /// `report.html`, and on request `map.pcd` and `points-full.ply` into `dir`, which
+    /// [`output_folder::prepare_output`] has made: all of them, in place of an earlier run's, or none. `write_more`
+    /// writes the other files of the set into the folder that it is given.
     pub fn write(
         &self,
         dir: &Path,
@@ -185,7 +185,7 @@ impl<'a> Results<'a> {
         let failed = |path: PathBuf, source| write_failure(dir, needed, path, source);
         let set = ResultSet::begin(dir).map_err(|source| failed(dir.to_owned(), source))?;
         let write = |name: &str, write: &dyn Fn(&Path) -> io::Result<()>| {
-            // Named by the place where the user looks for it.
+            // Errors name the place where the user looks for the file.
             write(&set.folder().join(name)).map_err(|source| failed(dir.join(name), source))
         };
         write("trajectory.txt", &|path| {
@@ -217,9 +217,9 @@ impl<'a> Results<'a> {
         set.commit().map_err(|source| failed(dir.to_owned(), source))
     }
 
-    /// About what the files of the run take.
+    /// Approximate size of the run's files, bytes.
     fn needed_bytes(&self, page: usize) -> u64 {
-        /// Of a line of either trajectory, a line of `keyframes.txt`, a point of `points.ply`.
+        /// Bytes of a line of either trajectory, a line of `keyframes.txt`, a point of `points.ply`.
         const POSE_BYTES: usize = 170;
         const KEYFRAME_BYTES: usize = 220;
         const CONFIRMED_BYTES: usize = 24;
@@ -236,15 +236,15 @@ impl<'a> Results<'a> {
     }
 }
 
-/// Keyframes of one epoch, the one that is written and shown; of the newest where none was tracked. Each epoch has a place
-/// and a unit of its own.
+/// Keyframes of the epoch that is written and shown; of the newest where none was tracked. Each epoch has a separate
+/// world and unit.
 fn keyframes_of(map: &Map, epoch: Option<u32>) -> Vec<&Keyframe> {
     let newest = map.keyframes.last().map(|keyframe| keyframe.epoch);
     let of_epoch = |keyframe: &&Keyframe| Some(keyframe.epoch) == epoch.or(newest);
     map.keyframes.iter().filter(of_epoch).collect()
 }
 
-/// What to say where a file cannot be written: how much is lacking, where it is room.
+/// The error of a file that cannot be written; names the lacking space where that is the cause.
 fn write_failure(dir: &Path, needed: u64, path: PathBuf, source: io::Error) -> ResultsError {
     use io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
     if !matches!(source.kind(), StorageFull | QuotaExceeded | FileTooLarge) {

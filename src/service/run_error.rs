@@ -1,4 +1,4 @@
-//! Why a run, or one of its processes, comes to nothing.
+//! Why a run, or one of its processes, fails.
 
 use std::io;
 
@@ -11,10 +11,10 @@ use crate::wire::keyframe_inbox::InboxError;
 use crate::wire::place_error::PlaceError;
 use crate::wire::port::{OpenError, ReceiveError, SendError, WaitError};
 
-/// Why a run does not start or its record cannot be made, or why one of its processes ends early.
+/// Why a run does not start, its record cannot be made, or one of its processes ends early.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
-    /// The place is not right, or taken.
+    /// The place is invalid or taken.
     #[error(transparent)]
     Place(#[from] PlaceError),
     /// A topic cannot be opened.
@@ -26,7 +26,7 @@ pub enum RunError {
     /// A message cannot be sent.
     #[error(transparent)]
     Send(#[from] SendError),
-    /// The others cannot be heard.
+    /// Messages of the other processes cannot be received.
     #[error(transparent)]
     Receive(#[from] ReceiveError),
     /// Keyframes cannot be received.
@@ -44,49 +44,49 @@ pub enum RunError {
     /// The configuration of tracking or mapping does not fit the frames.
     #[error("{0}: {1}")]
     Parameter(&'static str, ParameterError),
-    /// Size and intrinsics of no camera.
+    /// Size and intrinsics are not those of a camera.
     #[error("{0}: its size and intrinsics are not those of a camera; check its camera file or rig")]
     Intrinsics(SourceName),
-    /// A thread cannot be started, which does this.
+    /// The thread for this task cannot be started.
     #[error("cannot start the thread that {0} ({1})")]
     Thread(&'static str, io::Error),
-    /// No threads.
+    /// The mapper's threads cannot be started.
     #[error("cannot start {threads} mapper threads ({reason}); lower mapper.threads")]
     Pool {
-        /// How many were wanted.
+        /// Number of threads requested.
         threads: usize,
-        /// What the system says.
+        /// The system's error.
         reason: String,
     },
-    /// A process that must be there is not.
+    /// A required process is not ready.
     #[error(
         "{process} was not ready within {seconds} s; start it, or raise capture.connect_timeout_s"
     )]
     NotReady {
-        /// Which.
+        /// Which process.
         process: &'static str,
-        /// How long was waited.
+        /// The longest wait.
         seconds: f64,
     },
-    /// The map does not take in a frame.
+    /// The mapper does not take in a frame.
     #[error(
         "the mapper did not finish frame {sequence} within {seconds} s; raise capture.step_timeout_s if it is just slow"
     )]
     NoStep {
         /// Which frame.
         sequence: u64,
-        /// How long was waited.
+        /// The longest wait.
         seconds: f64,
     },
-    /// A signal, before the end.
+    /// A signal arrived before the end.
     #[error("interrupted")]
     Interrupted,
     /// A process cannot be started or watched.
     #[error("{process}: cannot be started or watched ({source})")]
     Child {
-        /// Which.
+        /// Which process.
         process: &'static str,
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
 }

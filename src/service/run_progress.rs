@@ -1,19 +1,19 @@
-//! How far a run is, for whoever shows it.
+//! Progress of a run, for its display.
 
 use crate::slam::pose::TrackingState;
 
-/// How far a run is, for whoever watches.
+/// Progress of a run, for an observer.
 #[derive(Debug, Clone, PartialEq)]
 pub enum RunProgress {
-    /// There is no camera, for this reason; it is used as soon as it is there.
+    /// The camera is absent, for this reason; it is used as soon as it appears.
     Waiting(String),
     /// The processes start, and the source is prepared: (done, total) of that work.
     Preparing(u64, u64),
-    /// Frames come.
+    /// Frames arrive.
     Running {
         /// Poses so far.
         frames: u64,
-        /// Frames there will be, 0 where unknown.
+        /// Frames in all, 0 where unknown.
         total: u64,
         /// State of the last frame.
         state: Option<TrackingState>,

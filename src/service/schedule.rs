@@ -1,5 +1,5 @@
-//! What a process asks of the kernel: policy and priority, CPUs, locked and touched memory, timer
-//! slack. What is refused is a warning that names the limit to raise; the process continues without.
+//! Requests of a process to the kernel: policy and priority, CPUs, locked and touched memory, timer slack. A refusal is
+//! a warning that names the limit to raise; the process continues without.
 
 use std::mem::MaybeUninit;
 use std::num::NonZeroU64;
@@ -10,33 +10,33 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::parameter::{ParameterError, check_range};
 
-/// How the kernel chooses when the frame loop runs.
+/// How the kernel schedules the frame loop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Policy {
-    /// As whoever started the process set it: a unit, chrt, or nobody.
+    /// As set for the process when it was started: by a unit, by chrt, or not at all.
     #[default]
     Inherit,
-    /// Shared with everybody (SCHED_OTHER).
+    /// Shared with every other process (SCHED_OTHER).
     Other,
-    /// Before everything of lower priority (SCHED_FIFO).
+    /// Ahead of everything of lower priority (SCHED_FIFO).
     Fifo,
     /// A guaranteed share of every period (SCHED_DEADLINE).
     Deadline,
 }
 
-/// How the kernel chooses when a thread runs that no frame waits for.
+/// How the kernel schedules a thread that no frame waits for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Background {
-    /// Only when a CPU has nothing else to do (SCHED_IDLE): everything else takes the CPU from it at once.
+    /// Only when a CPU has nothing else to do (SCHED_IDLE): any other thread takes the CPU from it at once.
     #[default]
     Idle,
-    /// As the other threads of its process.
+    /// Like the other threads of its process.
     Other,
 }
 
-/// What a process asks of the kernel for its frame loop.
+/// Requests of a process to the kernel for its frame loop.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SchedulingParams {
@@ -45,13 +45,13 @@ pub struct SchedulingParams {
     /// Priority of fifo, 1 to 99. Above the kernel's threaded interrupts (50) nothing else waits; capture
     /// comes before the tracker, or its frames would be late.
     pub priority: u32,
-    /// Computing time within each period, milliseconds, of deadline.
+    /// Deadline: computing time within each period, milliseconds.
     pub runtime_ms: f64,
-    /// Period of deadline, milliseconds: at most the time between two frames.
+    /// Deadline: period, milliseconds; at most the time between two frames.
     pub period_ms: f64,
-    /// CPUs that the frame loop may use, from 0; empty leaves them all. Deadline takes no CPUs.
+    /// CPUs that the frame loop may use, from 0; empty leaves all. Deadline accepts no CPUs.
     pub cpus: Vec<usize>,
-    /// Whether all memory, also what comes later, stays in RAM (mlockall): no page fault in the loop.
+    /// Whether all memory, present and future, stays in RAM (mlockall): no page fault in the loop.
     pub lock_memory: bool,
     /// How late the kernel may wake from a timed sleep, microseconds; 0 leaves the usual 50.
     pub timer_slack_us: u64,
@@ -71,7 +71,7 @@ impl Default for SchedulingParams {
     }
 }
 
-/// CPUs that the kernel's set of CPUs holds.
+/// Number of CPUs in the kernel's CPU set.
 const MAX_CPU: usize = CpuSet::MAX_CPU;
 
 impl SchedulingParams {
@@ -87,35 +87,35 @@ impl SchedulingParams {
     }
 }
 
-/// What the kernel refused; says which limit to raise.
+/// A request that the kernel refused, with the limit to raise.
 #[derive(Debug, thiserror::Error, Clone, PartialEq, Eq)]
 pub enum Refusal {
-    /// Not this policy, or not this priority.
+    /// The real-time policy, or its priority.
     #[error(
         "{0} scheduling refused ({2}): raise RLIMIT_RTPRIO to {1} (LimitRTPRIO= in the unit, rtprio in /etc/security/limits.conf)"
     )]
     RealTime(&'static str, u32, String),
-    /// No deadline policy.
+    /// The deadline policy.
     #[error(
         "deadline scheduling refused ({0}): it needs CAP_SYS_NICE (AmbientCapabilities= in the unit), no CPU list, and a free share of the CPUs"
     )]
     Deadline(String),
-    /// No lower priority.
+    /// The idle policy.
     #[error(
         "idle scheduling refused ({0}): allow sched_setattr, or set mapper.background = \"other\""
     )]
     Background(String),
-    /// Not these CPUs.
+    /// The CPUs.
     #[error(
         "CPUs {0:?} refused ({1}): name CPUs that exist and that the unit's CPUAffinity= allows"
     )]
     Cpus(Vec<usize>, String),
-    /// Memory cannot be locked.
+    /// Locking memory.
     #[error(
         "locking memory refused ({0}): raise RLIMIT_MEMLOCK (LimitMEMLOCK=infinity in the unit, memlock in /etc/security/limits.conf)"
     )]
     Memory(String),
-    /// No other timer slack.
+    /// The timer slack.
     #[error("timer slack refused ({0}): leave timer_slack_us at 0")]
     TimerSlack(String),
 }
@@ -123,7 +123,7 @@ pub enum Refusal {
 /// The scheduling in effect, as the kernel reports it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct InForce {
-    /// Policy of the calling thread; `None` where it is none that we know.
+    /// Policy of the calling thread; `None` for an unknown one.
     pub policy: Option<Policy>,
     /// Priority of FIFO, else 0.
     pub priority: u32,
@@ -136,7 +136,7 @@ const SCHED_OTHER: u32 = 0;
 const SCHED_FIFO: u32 = 1;
 const SCHED_IDLE: u32 = 5;
 const SCHED_DEADLINE: u32 = 6;
-/// Threads that are made later do not inherit the policy (linux/sched.h).
+/// Threads made later do not inherit the policy (linux/sched.h).
 const SCHED_FLAG_RESET_ON_FORK: u64 = 1;
 const NO_FLAGS: libc::c_uint = 0;
 const THIS_THREAD: libc::pid_t = 0;
@@ -155,11 +155,11 @@ struct SchedAttr {
     period: u64,
 }
 
-/// Applies `params` to the calling thread (memory: to the process), and gives what was refused. Threads that are
-/// made later run as SCHED_OTHER on the same CPUs.
+/// Applies `params` to the calling thread (memory: to the process) and returns the refusals. Threads made later run as
+/// SCHED_OTHER on the same CPUs.
 pub fn apply(params: &SchedulingParams) -> Vec<Refusal> {
     let mut refusals = Vec::new();
-    // Memory first: under FIFO the touching of new pages would hold up everybody else.
+    // Memory first: under FIFO, touching new pages would hold up everything else.
     if params.lock_memory {
         let flags = MlockAllFlags::CURRENT | MlockAllFlags::FUTURE;
         match rustix::mm::mlockall(flags) {
@@ -183,7 +183,7 @@ pub fn apply(params: &SchedulingParams) -> Vec<Refusal> {
     refusals
 }
 
-/// Makes the calling thread one that no frame waits for. The kernel refuses this to nobody, a sandbox may.
+/// Makes the calling thread one that no frame waits for. The kernel never refuses this, a sandbox may.
 pub fn apply_background(background: Background) -> Result<(), Refusal> {
     if background == Background::Other {
         return Ok(());
@@ -236,7 +236,7 @@ fn set_attributes(attributes: SchedAttr) -> std::io::Result<()> {
     if result == 0 { Ok(()) } else { Err(std::io::Error::last_os_error()) }
 }
 
-/// The scheduling of the calling thread, as the kernel tells it.
+/// The scheduling of the calling thread, as the kernel reports it.
 pub fn in_force() -> InForce {
     let mut attributes = SchedAttr::default();
     let size = size_of::<SchedAttr>() as libc::c_uint;
@@ -262,40 +262,41 @@ pub fn in_force() -> InForce {
     InForce { policy, priority, memory_locked: locked_kilobytes().is_some_and(|kb| kb > 0) }
 }
 
-/// Memory of this process that is locked, from the kernel's own account.
+/// Locked memory of this process according to the kernel.
 fn locked_kilobytes() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmLck:"))?;
     line.split_whitespace().next()?.parse().ok()
 }
 
-/// Touches the stack that the frame loop will use, so that its pages are there.
+/// Touches the stack that the frame loop will use, so that its pages are present.
 fn touch_stack() {
-    /// More than the deepest call of a frame takes, far less than the 8 MB that a main thread has.
+    /// More than the deepest call of a frame uses, far less than the 8 MB of a main thread.
     const STACK_BYTES: usize = 256 << 10;
     let stack = [MaybeUninit::<u8>::zeroed(); STACK_BYTES];
     std::hint::black_box(&stack);
 }
 
-/// Page faults of the calling thread so far, with and without input. One call to the kernel, no allocation.
+/// Page faults of the calling thread so far, with and without I/O. One system call, no allocation.
 pub fn thread_page_faults() -> u64 {
     let count = |value: libc::c_long| u64::try_from(value).unwrap_or(0);
     usage(libc::RUSAGE_THREAD).map_or(0, |of| count(of.ru_minflt) + count(of.ru_majflt))
 }
 
-/// Largest resident memory of this process so far; `None` where the kernel does not say. One call to the
-/// kernel, no allocation.
+/// Largest resident memory of this process so far; `None` where the kernel does not report it. One system call, no
+/// allocation.
 pub fn peak_rss_bytes() -> Option<u64> {
     const BYTES_PER_KB: u64 = 1024;
     u64::try_from(usage(libc::RUSAGE_SELF)?.ru_maxrss).ok()?.checked_mul(BYTES_PER_KB)
 }
 
-/// Has the allocator map every large block by itself and unmap it when it is freed. glibc otherwise raises its threshold
-/// with the first that is freed, and keeps the gaps between blocks that stay: an eighth of a replay's memory, a quarter with its results.
+/// Makes the allocator map every large block separately and unmap it when freed. Otherwise glibc raises its threshold
+/// with the first one freed and keeps the gaps between remaining blocks: an eighth of a replay's memory, a quarter with
+/// its results.
 pub fn give_back_large_blocks() {
     #[cfg(target_env = "gnu")]
     {
-        /// glibc's first threshold; an image of 640×480 is larger.
+        /// glibc's initial threshold; an image of 640×480 is larger.
         const LARGE_BYTES: libc::c_int = 128 << 10;
         // SAFETY: it sets a number of the allocator, which takes its own lock.
         unsafe { libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE_BYTES) };
@@ -313,13 +314,13 @@ fn usage(who: libc::c_int) -> Option<libc::rusage> {
 mod tests {
     use super::*;
 
-    /// Runs it in a thread of its own: the test runner's others keep their scheduling.
+    /// Runs in a separate thread: other threads of the test runner keep their scheduling.
     fn in_thread<T: Send + 'static>(run: impl FnOnce() -> T + Send + 'static) -> T {
         std::thread::spawn(run).join().unwrap()
     }
 
     #[test]
-    fn what_is_asked_for_is_in_force_or_refused_with_its_limit() {
+    fn a_request_is_in_force_or_refused_with_its_limit() {
         let asked = SchedulingParams { policy: Policy::Fifo, priority: 42, ..Default::default() };
         let (refusals, found) = in_thread(move || (apply(&asked), in_force()));
         match refusals.first() {
@@ -352,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_changed_unless_asked() {
+    fn nothing_changes_unless_requested() {
         let (before, refusals, after) =
             in_thread(|| (in_force(), apply(&SchedulingParams::default()), in_force()));
         assert_eq!((refusals, before), (Vec::new(), after));

@@ -1,4 +1,4 @@
-//! Shutdown as a value: SIGINT, SIGTERM and SIGHUP set it, every wait wakes by it, every loop looks at it.
+//! Shutdown as a value: SIGINT, SIGTERM and SIGHUP set it, every wait wakes on it, every loop checks it.
 
 use std::io::{self, Read};
 use std::os::fd::{AsFd, BorrowedFd};
@@ -8,19 +8,18 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
-/// Whether the process shall end, and a descriptor that is readable from then on.
+/// Whether the process should end, and a descriptor that is readable from then on.
 #[derive(Debug)]
 pub struct Shutdown {
     requested: Arc<AtomicBool>,
     readable: UnixStream,
-    /// One byte for each SIGINT.
+    /// One byte per SIGINT.
     interrupts: UnixStream,
     num_interrupts: AtomicUsize,
 }
 
 impl Shutdown {
-    /// Takes over SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal is closed), the last not where it is
-    /// ignored (`nohup`).
+    /// Takes over SIGINT (Ctrl-C), SIGTERM and, unless it is ignored (`nohup`), SIGHUP (the terminal is closed).
     pub fn install() -> io::Result<Self> {
         let requested = Arc::new(AtomicBool::new(false));
         let (readable, writable) = UnixStream::pair()?;
@@ -29,19 +28,19 @@ impl Shutdown {
         signal_hook::low_level::pipe::register(SIGINT, interrupted)?;
         let hang_up = (!is_ignored(SIGHUP)).then_some(SIGHUP);
         for signal in [SIGINT, SIGTERM].into_iter().chain(hang_up) {
-            // The flag first: whoever is woken by the descriptor must find it set.
+            // The flag first: a thread woken by the descriptor must find it set.
             signal_hook::flag::register(signal, Arc::clone(&requested))?;
             signal_hook::low_level::pipe::register(signal, writable.try_clone()?)?;
         }
         Ok(Self { requested, readable, interrupts, num_interrupts: AtomicUsize::new(0) })
     }
 
-    /// Whether the process shall end.
+    /// Whether the process should end.
     pub fn is_requested(&self) -> bool {
         self.requested.load(Ordering::Acquire)
     }
 
-    /// Whether Ctrl-C came twice: what is still waited for is to be given up.
+    /// Whether Ctrl-C was pressed twice: remaining waits are to be abandoned.
     pub fn is_urgent(&self) -> bool {
         const ENOUGH: usize = 2;
         let mut bytes = [0; ENOUGH];
@@ -49,7 +48,7 @@ impl Shutdown {
         self.num_interrupts.fetch_add(new, Ordering::Relaxed) + new >= ENOUGH
     }
 
-    /// Readable once the process shall end.
+    /// Readable once the process should end.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.readable.as_fd()
     }

@@ -1,4 +1,4 @@
-//! A long run under watch: memory of the processes, time per frame and keyframes, over time.
+//! A long monitored run: memory of the processes, time per frame and keyframes, over time.
 
 use std::ffi::OsString;
 use std::fmt::Write;
@@ -23,56 +23,56 @@ use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub};
 use crate::wire::topic::HEALTH_TOPICS;
 
-/// Places in [`HEALTH_TOPICS`].
+/// Indices in [`HEALTH_TOPICS`].
 const TRACKER: usize = 1;
 const MAPPER: usize = 2;
 const BYTES_PER_MEGABYTE: f64 = 1e6;
 
-/// A run to be watched.
+/// A run to monitor.
 #[derive(Debug, Clone)]
 pub struct Soak {
     /// Frames.
     pub frames: u64,
-    /// Frames in a second.
+    /// Frames per second.
     pub rate_hz: f64,
     /// Live or lockstep.
     pub mode: Mode,
-    /// Time from one sample to the next.
+    /// Time between two samples.
     pub period: Duration,
-    /// Its journal, which holds the poses as that of any run does.
+    /// Its journal, which holds the poses like that of any run.
     pub journal: JournalOptions,
 }
 
-/// How the processes were at one instant, and the times of the frames since the sample before.
+/// The state of the processes at one instant, and the times of the frames since the previous sample.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct Sample {
-    /// From the first frame, seconds.
+    /// Since the first frame, seconds.
     pub seconds: f64,
-    /// Frames that the tracker has had.
+    /// Frames that the tracker has received.
     pub frames: u64,
-    /// Frames without a pose: a newer one had come.
+    /// Frames without a pose, because a newer one had arrived.
     pub dropped: u64,
     /// Keyframes with image and depth.
     pub keyframes: u64,
-    /// Time of the tracker on a frame, milliseconds.
+    /// Time of the tracker per frame, milliseconds: median.
     pub track_p50_ms: f64,
     /// 99 of 100 are not longer.
     pub track_p99_ms: f64,
-    /// Time of the mapper on a frame.
+    /// Time of the mapper per frame: median.
     pub map_p50_ms: f64,
     /// 99 of 100 are not longer.
     pub map_p99_ms: f64,
-    /// CPU time of a joint estimate.
+    /// CPU time of a joint estimate: median.
     pub adjust_p50_ms: f64,
     /// 99 of 100 are not longer.
     pub adjust_p99_ms: f64,
-    /// Resident memory of the processes without what they share, megabytes.
+    /// Resident memory of capture, without what the processes share, megabytes.
     pub capture_mb: f64,
-    /// Of the tracker.
+    /// That of the tracker.
     pub tracker_mb: f64,
-    /// Of the mapper.
+    /// That of the mapper.
     pub mapper_mb: f64,
-    /// Of the process that watches and collects the poses.
+    /// That of the process that monitors and collects the poses.
     pub supervisor_mb: f64,
 }
 
@@ -94,20 +94,20 @@ const COLUMNS: [Column; 11] = [
     ("supervisor_mb", |s| s.supervisor_mb),
 ];
 
-/// How a quantity goes with time.
+/// The trend of a quantity over time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Trend {
     /// Name of the column.
     pub name: &'static str,
-    /// Mean of the second quarter of the samples: the first is warming up.
+    /// Mean of the second quarter of the samples; the first is warm-up.
     pub second_quarter: f64,
     /// Mean of the last quarter.
     pub last_quarter: f64,
-    /// Slope of the straight line through the last three quarters, for each hour.
+    /// Slope of the straight line through the last three quarters, per hour.
     pub per_hour: f64,
 }
 
-/// Runs it and returns the samples, also where it is interrupted.
+/// Runs it and returns the samples, even if it is interrupted.
 pub fn soak(
     config: &Config,
     soak: &Soak,
@@ -129,7 +129,7 @@ pub fn soak(
             watch.look();
         }
     })?;
-    // There are no results that it could be needed for.
+    // There are no results that would need it.
     if let Some(Err(error)) = outcome.journal.map(Journal::finish) {
         tracing::warn!("the journal of the soak stays: {error}");
     }
@@ -139,7 +139,7 @@ pub fn soak(
     }
 }
 
-/// Who listens to the processes while they run.
+/// Monitors the processes while they run.
 struct Watch {
     place: Place,
     period: Duration,
@@ -159,14 +159,14 @@ impl Watch {
         Self { place, period, peers, started, next: Instant::now(), before, samples: Vec::new() }
     }
 
-    /// Takes a sample where one is due; whoever cannot be heard yet is asked again at the next look.
+    /// Takes a sample when one is due; a process without a message yet is queried again at the next call.
     fn look(&mut self) {
         let started = *self.started.get_or_insert_with(Instant::now);
         if self.peers.is_none() {
             self.peers = listen(&self.place);
         }
         let Some((hub, peers)) = &mut self.peers else { return };
-        // What is to come to somebody who joined late is sent when connections are looked at.
+        // Messages for late subscribers are sent when connections are checked.
         let _ = hub;
         let heard = peers.iter_mut().map(|peer| peer.update().ok().flatten().copied());
         let heard: Option<Vec<HealthMessage>> = heard.collect();
@@ -204,9 +204,9 @@ fn listen(place: &Place) -> Option<(Hub, [Peer; 3])> {
     Some((hub, peers.try_into().ok()?))
 }
 
-/// Median and 99 of 100 of the times that were counted since; NaN where none was.
+/// Median and 99th percentile of the times counted since then; NaN without any.
 fn since(now: &Counts, before: &Counts) -> [f64; 2] {
-    // A process that was started again counts from 0.
+    // A restarted process counts from 0.
     let counts = std::array::from_fn(|i| now[i].saturating_sub(before[i]));
     [0.5, 0.99].map(|share| percentile_ms(&counts, share).unwrap_or(f64::NAN))
 }
@@ -220,7 +220,7 @@ fn resident_mb(process: &str) -> f64 {
     kilobytes.map_or(f64::NAN, |kilobytes| kilobytes * BYTES_PER_KB / BYTES_PER_MEGABYTE)
 }
 
-/// How each quantity goes with time; none of fewer than four samples.
+/// The trend of each quantity; empty for fewer than four samples.
 pub fn trends(samples: &[Sample]) -> Vec<Trend> {
     let quarter = samples.len() / 4;
     if quarter == 0 {
@@ -236,14 +236,14 @@ pub fn trends(samples: &[Sample]) -> Vec<Trend> {
     COLUMNS.iter().map(of).collect()
 }
 
-/// Mean of the values that are numbers.
+/// Mean of the finite values.
 fn mean(samples: &[Sample], value: fn(&Sample) -> f64) -> f64 {
     let values = samples.iter().map(value).filter(|value| value.is_finite());
     let (sum, count) = values.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));
     sum / count
 }
 
-/// Slope of the straight line of least squares, for each second.
+/// Slope of the least-squares line, per second.
 fn slope(samples: &[Sample], value: fn(&Sample) -> f64) -> f64 {
     let points = || {
         let all = samples.iter().map(|sample| (sample.seconds, value(sample)));
@@ -258,7 +258,7 @@ fn slope(samples: &[Sample], value: fn(&Sample) -> f64) -> f64 {
     if below > 0.0 { above / below } else { 0.0 }
 }
 
-/// The samples as lines with commas, the first with the names of the columns; what is not known is left empty.
+/// The samples as comma-separated lines, the first with the column names; unknown values are left empty.
 pub fn csv(samples: &[Sample]) -> String {
     let names = COLUMNS.map(|(name, _)| name).join(",");
     let mut text = format!("seconds,frames,dropped,{names}\n");
@@ -283,7 +283,7 @@ mod tests {
         let sample = |k: u32| Sample {
             seconds: 10.0 * f64::from(k),
             frames: 300 * u64::from(k),
-            // 40 an hour, and flat.
+            // 40 per hour, and flat.
             keyframes: 40 * u64::from(k) / 360,
             mapper_mb: 100.0 + 40.0 * 10.0 * f64::from(k) / 3600.0,
             track_p50_ms: if k == 390 { f64::NAN } else { 3.0 },
@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn what_grows_has_a_slope_and_what_is_flat_has_none() {
+    fn a_growing_quantity_has_a_slope_and_a_flat_one_has_none() {
         let trends = trends(&samples());
         let of = |name: &str| *trends.iter().find(|trend| trend.name == name).unwrap();
         assert!((of("mapper_mb").per_hour - 40.0).abs() < 1e-6, "{:?}", of("mapper_mb"));
@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_has_as_many_values_as_names_and_none_is_not_a_number() {
+    fn a_line_has_a_value_per_name_and_no_nan() {
         let text = csv(&samples());
         let columns = text.lines().next().unwrap().split(',').count();
         assert_eq!(text.lines().count(), 401);
@@ -314,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn times_are_of_the_frames_since_the_sample_before() {
+    fn times_cover_the_frames_since_the_previous_sample() {
         let (mut now, mut before) = ([0; HISTOGRAM_BUCKETS], [0; HISTOGRAM_BUCKETS]);
         (now[10], before[10], now[20]) = (1000, 1000, 5);
         let [median, _] = since(&now, &before);
@@ -324,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn memory_is_that_of_the_process_and_unknown_where_there_is_none() {
+    fn memory_is_that_of_the_process_and_nan_without_one() {
         let held = std::hint::black_box(vec![1_u8; 8_000_000]);
         let resident = resident_mb("self");
         assert!(resident > 7.0, "{resident} MB with {} bytes", held.len());

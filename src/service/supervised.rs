@@ -1,5 +1,5 @@
-//! One process as its supervisor sees it: whether it lives, when it gave the last sign of life, when it is
-//! started again and why it had to be.
+//! One process from the supervisor's side: whether it lives, its last sign of life, when it is restarted and why it had
+//! to be.
 
 use std::io;
 use std::os::unix::process::ExitStatusExt;
@@ -19,50 +19,50 @@ use crate::wire::port::ReceiveError;
 use crate::wire::shared_memory::free_shared_memory;
 use crate::wire::topic::CAPTURE_HEALTH;
 
-/// Pause before the second restart in a row; it doubles up to the longest. The first comes at once.
+/// Pause before the second restart in a row; it doubles up to the longest. The first restart is immediate.
 const FIRST_BACK_OFF: Duration = Duration::from_millis(50);
 /// Longest pause before a restart.
 const LONGEST_BACK_OFF: Duration = Duration::from_secs(5);
-/// A process that has lived so long did not die of its start: the pauses begin anew.
+/// A process that has lived this long did not die of its start: the pauses begin anew.
 const HEALTHY_LIFE: Duration = Duration::from_secs(2);
-/// Kills from outside in a row, of processes that were ready, that are no sign of a fault: an operator or a test
-/// kills at any rate. The kernel, where memory runs out, would kill the next one too: from then on they count.
+/// External kills in a row, of ready processes, that are not a sign of a fault: an operator or a test kills at any
+/// rate. The kernel, when memory runs out, would kill the next one too: from then on they count.
 const KILLS_AT_ONCE: u32 = 10;
-/// Shortest time that a process has for its first sign of life: it is loaded, reads its configuration and
-/// joins the others, on a machine that may be busy.
+/// Shortest time that a process has for its first sign of life: it is loaded, reads its configuration and joins the
+/// others, on a machine that may be busy.
 const FIRST_SIGN: Duration = Duration::from_secs(30);
-/// A supervisor that did not look for so long was held up itself, and cannot tell who was silent meanwhile.
+/// A supervisor that has not checked for this long was held up itself and cannot tell which process was silent.
 const HELD_UP: Duration = Duration::from_secs(1);
-/// Free shared memory below which a SIGBUS is put down to its end, bytes: less than the smallest segment of
+/// Free shared memory below which a SIGBUS is attributed to its exhaustion, bytes: less than the smallest segment of
 /// images.
 const NEARLY_FULL_BYTES: u64 = 1 << 20;
 
 /// Why a process ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Death {
-    /// One line, which names the process.
+    /// One line that names the process.
     pub cause: String,
-    /// Whether it ended by itself with an error of its own, which it would meet again.
+    /// Whether it exited with an error of its own, which it would meet again.
     pub is_fault: bool,
-    /// Whether memory that it had mapped was not there.
+    /// Whether memory that it had mapped was missing.
     pub is_bus_error: bool,
-    /// Whether it was killed by SIGKILL, and not by its supervisor.
+    /// Whether it was killed by a SIGKILL that its supervisor did not send.
     pub is_kill: bool,
 }
 
 /// One of the three processes.
 #[derive(Debug)]
 pub struct Supervised {
-    /// What it says of itself.
+    /// Its published health.
     pub peer: Peer,
     child: Option<Child>,
-    /// When the next one is due, while there is none.
+    /// When the next start is due, while it does not run.
     due: Option<Instant>,
     /// Restarts in a row of processes that died young.
     hasty_restarts: u32,
-    /// Kills in a row that did not count as that.
+    /// Kills in a row that did not count as such.
     kills: u32,
-    /// Causes of the restarts so far, each with how often.
+    /// Causes of the restarts so far, each with its count.
     causes: Vec<(String, u64)>,
     last_sign: Instant,
     last_look: Instant,
@@ -70,7 +70,7 @@ pub struct Supervised {
 }
 
 impl Supervised {
-    /// A process that is to be started.
+    /// A process that is due to start.
     pub fn new(peer: Peer) -> Self {
         let now = Instant::now();
         Self {
@@ -91,30 +91,30 @@ impl Supervised {
         self.peer.name()
     }
 
-    /// The process itself, where it has been started and its end has not been met.
+    /// The process itself, if it was started and its end has not been noticed.
     pub fn child(&mut self) -> Option<&mut Child> {
         self.child.as_mut()
     }
 
-    /// Whether it is to be started now.
+    /// Whether it is due to start now.
     pub fn is_due(&self) -> bool {
         self.due.is_some_and(|due| due <= Instant::now())
     }
 
-    /// It has been started.
+    /// Notes that it was started.
     pub fn run(&mut self, child: Child) {
         (self.child, self.due, self.was_ready) = (Some(child), None, false);
         (self.last_sign, self.last_look) = (Instant::now(), Instant::now());
     }
 
-    /// Takes in what it says of itself.
+    /// Receives its published health.
     pub fn listen(&mut self) -> Result<(), ReceiveError> {
-        // What one that has ended said last stays; what one that was killed said is counted already.
+        // The last health of a process that has ended is kept; that of a killed one has been counted already.
         let Some(pid) = self.child.as_ref().map(Child::id) else { return Ok(()) };
         let now = Instant::now();
         let before = self.peer.last().map(|health| health.published_nanos);
         let last = self.peer.update()?.map(|health| (health.process_id, health.published_nanos));
-        // Not the last word of the one before.
+        // Not the last message of its predecessor.
         let is_own = last.is_some_and(|(id, _)| id == pid);
         let was_held_up = now.duration_since(self.last_look) > HELD_UP;
         if was_held_up || is_own && last.map(|(_, nanos)| nanos) != before {
@@ -139,24 +139,24 @@ impl Supervised {
             matches!(self.peer.state(), Some(ProcessState::Finished | ProcessState::Failed));
         let writes_map = self.peer.last().is_some_and(|last| cause(last) == WRITES_MAP);
         let silence = self.last_look.duration_since(self.last_sign);
-        // One that is at its end has said its last word, and has as long as any other to leave. One that writes
-        // its map gives a sign between two keyframes, each of which a slow disk may hold up.
+        // A process at its end has sent its last message, and has as long as any other to exit. One that writes its map
+        // gives a sign between two keyframes, each of which a slow disk may delay.
         let extra = if is_at_its_end || writes_map { FIRST_SIGN } else { Duration::ZERO };
         silence > allowed + extra
     }
 
-    /// How it ended, if it did; one that gives no sign of life is killed. An end in order (`None` within)
-    /// is no death.
+    /// How it ended, if it did; a process without a sign of life is killed. An orderly end (`None` within) is not a
+    /// death.
     pub fn poll(&mut self, watchdog: Duration) -> io::Result<Option<Option<Death>>> {
         let is_silent = self.is_silent(watchdog);
         let name = self.peer.name();
         let Some(child) = &mut self.child else { return Ok(None) };
         if let Some(status) = child.poll()? {
             let fault = child.fault();
-            // Its last words; without them its counts are a moment older.
+            // Its last health; without it its counts are slightly older.
             drop(self.listen());
             self.bury();
-            // Only capture ends by itself: with its source.
+            // Only capture ends without being stopped: with its source.
             let is_end = status.success() && name == CAPTURE_HEALTH.owner;
             return Ok(Some((!is_end).then(|| death(name, status, fault))));
         }
@@ -170,31 +170,30 @@ impl Supervised {
         Ok(Some(Some(Death { cause, is_fault: false, is_bus_error: false, is_kill: false })))
     }
 
-    /// It has ended: its life counts for the pause before the next.
+    /// Notes its end: its life counts for the pause before the next start.
     fn bury(&mut self) {
-        // One that never got ready died of its start, however long that took.
+        // A process that never became ready died of its start, however long that took.
         if self.was_ready && self.child.as_ref().is_some_and(|child| child.age() > HEALTHY_LIFE) {
             (self.hasty_restarts, self.kills) = (0, 0);
         }
         self.child = None;
     }
 
-    /// Whether it is started again after this death: a process that names a fault of its own would
-    /// meet it again, unless it is one that has just taken the place of another and found the place not yet
-    /// cleared, or another was killed at that time (`kill_is_felt`), whose half-made ports it has met.
+    /// Whether it is restarted after this death: a process that reports a fault of its own would meet it again, unless
+    /// it has just replaced another and found the place not yet cleared, or another was killed at that time
+    /// (`kill_is_felt`), whose half-made ports it met.
     pub fn may_restart(&self, death: &Death, kill_is_felt: bool, max_restarts: u32) -> bool {
         let is_own = death.is_fault && (self.was_ready || self.restarts() == 0);
         (kill_is_felt || !is_own)
             && (self.is_mere_kill(death) || self.hasty_restarts < max_restarts)
     }
 
-    /// Whether this death says nothing of the process: it was ready, and somebody killed it.
+    /// Whether this death shows nothing about the process: it was ready, and was killed from outside.
     fn is_mere_kill(&self, death: &Death) -> bool {
         death.is_kill && self.was_ready && self.kills < KILLS_AT_ONCE
     }
 
-    /// Plans the next start: at once for a process that had lived, later and later for one that dies of
-    /// its start.
+    /// Plans the next start: at once for a process that had lived, with growing pauses for one that dies of its start.
     pub fn plan_restart(&mut self, death: Death) {
         if self.is_mere_kill(&death) {
             self.due = Some(Instant::now());
@@ -209,12 +208,12 @@ impl Supervised {
         }
     }
 
-    /// How often it was started again.
+    /// Number of restarts.
     pub fn restarts(&self) -> u64 {
         self.causes.iter().map(|(_, count)| count).sum()
     }
 
-    /// Why, each cause with how often.
+    /// Causes of the restarts, each with its count.
     pub fn restart_causes(&self) -> impl Iterator<Item = RestartCause> {
         let process = self.name();
         self.causes.iter().map(move |(cause, count)| RestartCause {
@@ -245,7 +244,7 @@ fn death(name: &str, status: ExitStatus, fault: Option<String>) -> Death {
     Death { cause, is_fault, is_bus_error, is_kill }
 }
 
-/// What a SIGBUS means: a page that was promised and is not there.
+/// The meaning of a SIGBUS: a page that was promised is missing.
 fn bus_error(name: &str, free_bytes: Option<u64>) -> String {
     match free_bytes {
         Some(free) if free < NEARLY_FULL_BYTES => format!(
@@ -258,7 +257,7 @@ fn bus_error(name: &str, free_bytes: Option<u64>) -> String {
     }
 }
 
-/// Without the time: equal causes are one line of the summary, with their number.
+/// Without the time, so that equal causes are one line of the summary, with their count.
 fn hang(name: &str, liveness: Liveness) -> String {
     match liveness {
         Liveness::Stopped => format!(
@@ -290,7 +289,7 @@ mod tests {
     use crate::wire::port::{Access, Hub};
 
     #[test]
-    fn the_first_restart_is_at_once_and_the_pauses_grow_to_a_bound() {
+    fn the_first_restart_is_immediate_and_pauses_grow_to_a_bound() {
         assert_eq!(back_off(0), Duration::ZERO);
         assert_eq!(back_off(1), FIRST_BACK_OFF);
         assert_eq!(back_off(2), 2 * FIRST_BACK_OFF);
@@ -299,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fault_of_its_own_is_met_again_and_that_of_a_kill_is_not() {
+    fn a_fault_of_its_own_forbids_a_restart_and_one_after_a_kill_does_not() {
         let folder = tempfile::tempdir_in("/tmp").unwrap();
         let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
         let hub = Hub::join(&place, "supervisor", Access::Member).unwrap();
@@ -316,7 +315,7 @@ mod tests {
         assert!(!may(&process, &fault, false) && may(&process, &fault, true));
         process.plan_restart(fault.clone());
         assert!(!may(&process, &fault, true), "too often");
-        // Kills of one that was ready say nothing of it, until there are many.
+        // Kills of a ready process show nothing about it, until there are many.
         for _ in 0..KILLS_AT_ONCE {
             assert!(may(&process, &kill, false));
             process.plan_restart(kill.clone());
@@ -331,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn a_death_says_what_it_was() {
+    fn a_death_names_its_cause() {
         let of = |raw: i32| death("mapper", ExitStatus::from_raw(raw), None);
         let killed = of(9);
         assert!(killed.cause.starts_with("mapper was killed by SIGKILL"), "{killed:?}");

@@ -1,4 +1,4 @@
-//! Starts the three processes, watches them, collects what they publish, ends them in order, leaves nothing behind.
+//! Starts the three processes, watches them, collects what they publish, ends them in order and leaves nothing behind.
 
 use std::ffi::OsString;
 use std::fmt::Write;
@@ -37,40 +37,40 @@ use crate::wire::place::{Claim, Place};
 use crate::wire::port::{Access, Hub, wait};
 use crate::wire::topic::{HEALTH_TOPICS, shared_memory_bytes};
 
-/// Longest sleep without a look at children, signals and progress.
+/// Longest sleep between two checks of children, signals and progress.
 const WAKE_PERIOD: Duration = Duration::from_millis(50);
-/// After the last frame of a live run: silence that means all of it has been handled.
+/// Silence after the last frame of a live run that means all of it has been processed.
 const SILENCE: Duration = Duration::from_millis(500);
-/// Time between two looks for shared memory that is promised and not taken.
+/// Time between two checks for shared memory that is promised and not yet reserved.
 const RESERVE_PERIOD: Duration = Duration::from_secs(1);
-/// How long after a kill a process may still fail of it: opening what one that was killed in its start has left
-/// half made is tried fifty times, half a second each.
+/// How long after a kill a process may still fail because of it: opening what a process killed in its start left half
+/// made is tried fifty times, half a second each.
 const KILL_IS_FELT: Duration = Duration::from_secs(30);
-/// Pause between two looks for the end or the answer of a process.
+/// Pause between two checks for the end or the answer of a process.
 const ANSWER_PAUSE: Duration = Duration::from_millis(5);
 
 /// What to run.
 #[derive(Debug, Clone)]
 pub struct RunOptions {
-    /// Where frames come from.
+    /// Source of the frames.
     pub source: SourceName,
     /// The camera's rig file.
     pub rig: Option<PathBuf>,
     /// Lockstep or live.
     pub mode: Mode,
-    /// Folder for results; it exists.
+    /// Folder for results, which exists.
     pub output: PathBuf,
     /// Whether the map is fetched at the end.
     pub keeps_map: bool,
     /// The journal to keep; without one a kill of the supervisor loses the run.
     pub journal: Option<JournalOptions>,
-    /// Options that every child gets: where the configuration comes from.
+    /// Options for every child: the origin of the configuration.
     pub arguments: Vec<OsString>,
-    /// Where the log of the children goes.
+    /// Receives the log of the children.
     pub log: ErrorLog,
 }
 
-/// A run that is over: its record is whole up to its end.
+/// A finished run: its record is complete up to its end.
 pub struct RunOutcome {
     /// Everything for the results.
     pub record: RunRecord,
@@ -91,11 +91,11 @@ pub fn run(
     check_camera(&config.map, &source.intrinsics()).map_err(MapSessionError::from)?;
     let place = Place::new(&config.instance, &config.root)?;
     let _claim = claim_all(&place)?;
-    // What a run before has left is not of this one.
+    // State left by an earlier run does not belong to this one.
     place.forget_run();
     place.check_shared_memory(shared_memory_bytes(&source.intrinsics(), None))?;
     let outcome = supervise(config, options, &place, source, shutdown, observe);
-    // However it ended, nobody continues from here.
+    // However it ended, no process continues from here.
     place.forget_run();
     outcome
 }
@@ -160,7 +160,7 @@ fn supervise(
     Ok(RunOutcome { record, journal, source })
 }
 
-/// The journal of the run. Without one it continues.
+/// Begins the journal of the run, which continues without one.
 fn begin_journal(options: &RunOptions, place: &Place) -> Option<Journal> {
     let begun = Journal::begin(options.journal.as_ref()?, place);
     begun
@@ -172,7 +172,7 @@ fn begin_journal(options: &RunOptions, place: &Place) -> Option<Journal> {
         .ok()
 }
 
-/// The claim of the supervisor, after a look that none of the three runs already.
+/// The claim of the supervisor, after a check that none of the three runs already.
 fn claim_all(place: &Place) -> Result<Claim, RunError> {
     let claim = place.claim("supervisor")?;
     for topic in HEALTH_TOPICS {
@@ -198,13 +198,13 @@ struct Supervisor<'a> {
     recorder: Recorder,
     commands: CommandClient,
     hub: Hub,
-    /// What processes that have ended had counted.
+    /// Counts of processes that have ended.
     of_ended: RunCounters,
-    /// Why a process last died of memory that was not there: a run that meets it is no success.
+    /// Why a process last died of missing memory: a run with such a death is not a success.
     bus_error: Option<String>,
     /// When a process was last killed, or hung.
     killed: Option<Instant>,
-    /// When shared memory was last taken, and whether some of it was not to be had.
+    /// When shared memory was last reserved, and whether some of it was unavailable.
     reserved: Instant,
     is_short: bool,
 }
@@ -237,9 +237,9 @@ impl<'a> Supervisor<'a> {
         Ok(supervisor)
     }
 
-    /// Starts every process that is due, those that died together at the same time.
+    /// Starts every process that is due; those that died together start together.
     fn start_due(&mut self) -> Result<(), RunError> {
-        // Who reads before who writes.
+        // Readers before writers.
         for index in [MAPPER, TRACKER, CAPTURE] {
             if self.processes[index].is_due() {
                 let child = self.spawn(self.processes[index].name())?;
@@ -267,7 +267,7 @@ impl<'a> Supervisor<'a> {
             .map_err(|source| RunError::Child { process: name, source })
     }
 
-    /// Until the source ends, a signal comes or a process fails for good.
+    /// Watches until the source ends, a signal arrives or a process fails for good.
     fn watch(
         &mut self,
         shutdown: &Shutdown,
@@ -294,7 +294,7 @@ impl<'a> Supervisor<'a> {
         }
     }
 
-    /// Takes what subscribers that have come meanwhile were promised of shared memory.
+    /// Reserves the shared memory promised to subscribers that have joined meanwhile.
     fn keep_reserved(&mut self) {
         if self.reserved.elapsed() < RESERVE_PERIOD {
             return;
@@ -327,8 +327,8 @@ impl<'a> Supervisor<'a> {
         }
     }
 
-    /// Looks who has ended or hangs: the source's end ends the run, a death restarts the process (live) or
-    /// ends the run (lockstep: a frame without an answer cannot be made good).
+    /// Checks which processes have ended or hang: the source's end ends the run, a death restarts the process (live) or
+    /// ends the run (lockstep: a frame without an answer cannot be recovered).
     fn check_processes(&mut self) -> Result<Option<EndOfRun>, RunError> {
         let watchdog = Duration::from_secs_f64(self.config.supervisor.watchdog_s);
         let mut deaths = Vec::new();
@@ -347,7 +347,7 @@ impl<'a> Supervisor<'a> {
         if deaths.is_empty() {
             return Ok(None);
         }
-        // All of them first: what one names as its fault may be the end of another.
+        // All of them first: the fault that one reports may be the end of another.
         if deaths.iter().any(|(_, death)| !death.is_fault) {
             self.killed = Some(Instant::now());
         }
@@ -363,7 +363,7 @@ impl<'a> Supervisor<'a> {
         Ok(None)
     }
 
-    /// Plans a restart after a death, or says that there is none.
+    /// Plans a restart after a death, or returns the failure of the run.
     fn mourn(&mut self, index: usize, death: Death) -> Option<EndOfRun> {
         if death.is_bus_error {
             self.bus_error = Some(death.cause.clone());
@@ -380,8 +380,8 @@ impl<'a> Supervisor<'a> {
         None
     }
 
-    /// What a process has counted: by its last health, which may be a second old where it was killed, and for
-    /// capture by the place that it wrote down with every frame.
+    /// Counts of a process: from its last health, which may be a second old where it was killed, and for capture from
+    /// the position that it writes with every frame.
     fn counted(&self, index: usize) -> RunCounters {
         let mut counted = RunCounters::default();
         let Some(health) = self.processes[index].peer.last() else { return counted };
@@ -406,7 +406,7 @@ impl<'a> Supervisor<'a> {
         counted
     }
 
-    /// Asks a process to stop, and kills it when it does not, or at a second Ctrl-C.
+    /// Asks a process to stop, and kills it if it does not, or at a second Ctrl-C.
     fn stop(&mut self, index: usize, shutdown: &Shutdown) {
         let end = Instant::now() + Duration::from_secs_f64(self.config.supervisor.stop_timeout_s);
         let name = self.processes[index].name();
@@ -422,7 +422,7 @@ impl<'a> Supervisor<'a> {
         child.kill();
     }
 
-    /// Collects what is still under way after the last frame.
+    /// Collects what is still in flight after the last frame.
     fn settle(&mut self, ended: &EndOfRun, shutdown: &Shutdown) -> Result<(), RunError> {
         self.recorder.collect()?;
         if self.options.mode == Mode::Lockstep || matches!(ended, EndOfRun::Failed(_)) {
@@ -443,13 +443,13 @@ impl<'a> Supervisor<'a> {
         final_map(&mut self.processes[MAPPER], &self.commands, folder, config, shutdown)
     }
 
-    /// What a mapper that cannot be asked has written down last.
+    /// The last checkpoint of a mapper that cannot be queried.
     fn map_of_checkpoint(&self) -> Map {
         let left = read_checkpoint(&self.place.checkpoint_path());
         left.inspect_err(|error| tracing::warn!("{error}")).ok().flatten().unwrap_or_default()
     }
 
-    /// What capture says of images that it has left out.
+    /// The report of capture on images that it left out.
     fn refused(&mut self) -> Result<Option<String>, RunError> {
         let is_camera = self.options.source.is_camera();
         let last = self.processes[CAPTURE].peer.update()?.filter(|last| last.refused > 0);
@@ -459,7 +459,7 @@ impl<'a> Supervisor<'a> {
         }))
     }
 
-    /// Ends the others, and gives what was collected.
+    /// Ends the others and returns what was collected.
     fn finish(
         mut self,
         shutdown: &Shutdown,
@@ -480,13 +480,13 @@ impl<'a> Supervisor<'a> {
         self.processes.iter().map(Supervised::restarts).sum()
     }
 
-    /// What was counted until now.
+    /// The counts so far.
     fn counters(&self) -> RunCounters {
         let peaks = self.processes.iter().filter_map(|p| Some(p.peer.last()?.peak_rss_bytes));
         let mut sums = self.of_ended;
         [CAPTURE, TRACKER].into_iter().for_each(|index| sums.add(&self.counted(index)));
         RunCounters {
-            // Who is killed leaves the count of a moment before.
+            // A killed process leaves slightly older counts.
             frames_in: sums.frames_in.max(self.recorder.recording.num_poses() as u64),
             restarts: self.restarts(),
             peak_rss_bytes: peaks.sum::<u64>() + peak_rss_bytes().unwrap_or(0),

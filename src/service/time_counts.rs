@@ -1,10 +1,10 @@
-//! Times of a run, counted.
+//! Counted times of a run.
 
 use serde::{Deserialize, Serialize};
 
 use crate::wire::message::HISTOGRAM_BUCKETS;
 
-/// Times by the buckets of [`crate::service::health::bucket`].
+/// Times counted in the buckets of [`crate::service::health::bucket`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(into = "Vec<u64>", from = "Vec<u64>")]
 pub struct TimeCounts(pub [u64; HISTOGRAM_BUCKETS]);
@@ -30,7 +30,7 @@ impl From<TimeCounts> for Vec<u64> {
 }
 
 impl From<Vec<u64>> for TimeCounts {
-    /// Buckets that are missing are empty.
+    /// Missing buckets are empty.
     fn from(counts: Vec<u64>) -> Self {
         Self(std::array::from_fn(|i| counts.get(i).copied().unwrap_or(0)))
     }

@@ -1,4 +1,4 @@
-//! The tracker process: waits for frames, adopts keyframes, publishes one pose for each frame.
+//! The tracker process: waits for frames, adopts keyframes, publishes one pose per frame.
 
 use std::time::Duration;
 
@@ -27,15 +27,15 @@ use crate::wire::place::{Claim, Place};
 use crate::wire::port::{Access, Hub, Publisher, ReceiveError, Received, Subscriber, wait};
 use crate::wire::topic::{FRAME, POSE, TRACKER_HEALTH};
 
-/// Longest sleep without a look at signals and health.
+/// Longest sleep between two checks of signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
-/// Frames until everything that the loop uses has been touched: page faults count from here.
+/// Frames until the loop has touched everything it uses: page faults count from here.
 const WARM_UP_FRAMES: u64 = 100;
 
-/// Runs the process until the signal.
+/// Runs the process until a signal arrives.
 pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), RunError> {
     let mut shell = Shell::prepare(config, mode)?;
-    // After the thread that prepares keyframes was made: that one stays ordinary.
+    // After the thread that prepares keyframes was made, which keeps ordinary scheduling.
     let refusals = apply(&config.tracker.scheduling);
     refusals.iter().for_each(|refusal| tracing::warn!("tracker: {refusal}"));
     shell.health.tell_scheduling(&refusals);
@@ -57,7 +57,7 @@ struct Shell<'a> {
     last_intrinsics: Option<Intrinsics>,
     costs: IterationCosts,
     order: FrameOrder,
-    /// CLOCK_MONOTONIC when the last frame arrived.
+    /// CLOCK_MONOTONIC of the arrival of the last frame.
     last_arrival_nanos: Option<i64>,
     /// Page faults of this thread until the loop was warm.
     warm_page_faults: Option<u64>,
@@ -117,8 +117,8 @@ impl<'a> Shell<'a> {
         Ok(())
     }
 
-    /// Sleeps until something happens; the frame that has come. Live, where the configuration asks for it, it is awake
-    /// when the next frame is near and looks for it.
+    /// Sleeps until something happens; returns a frame that has arrived. Live, if it is configured to, it wakes shortly
+    /// before the next frame and polls for it.
     fn await_frame(
         &mut self,
         shutdown: &Shutdown,
@@ -154,7 +154,7 @@ impl<'a> Shell<'a> {
         let (frame, intrinsics) = match frame_from_message(&header, received.payload()) {
             Ok(frame) => frame,
             Err(_) => {
-                // Not logged: whoever sends many of them must not make this loop do I/O.
+                // Not logged: a sender of many such frames must not make this loop do I/O.
                 self.health.counters().refused += 1;
                 self.health.enter(ProcessState::Running, "a broken frame was refused");
                 return Ok(());
@@ -175,8 +175,8 @@ impl<'a> Shell<'a> {
         Ok(())
     }
 
-    /// The pose of a frame, and the time that tracking it took: in lockstep the reference is prepared
-    /// in this thread too, but it is paid per keyframe and not part of it.
+    /// The pose of a frame, and the time it took to track: in lockstep the reference is prepared in this thread too,
+    /// but that is a cost per keyframe and not part of it.
     fn track(
         &mut self,
         frame: &FrameView<'_>,
@@ -201,11 +201,11 @@ impl<'a> Shell<'a> {
             if let Some(used) = tracker.adopt(reference) {
                 self.references.give_back(used);
             }
-            // Another tracker's, which died.
+            // The last pose from a previous tracker, which died.
             let last = self.references.last_pose().filter(|last| last.epoch == epoch);
             match last {
                 Some(last) => tracker.resume_at(last.nanos, &last.world_from_camera),
-                // The map may be that of a mapper that died as well, and the camera anywhere on it.
+                // The map may come from a mapper that died as well, and the camera may be anywhere in it.
                 None if is_first
                     && (self.mode == Mode::Live || Tracker::is_found_on(keyframe_id)) =>
                 {
@@ -223,7 +223,7 @@ impl<'a> Shell<'a> {
         Ok((estimate, now_nanos().saturating_sub(begin_nanos)))
     }
 
-    /// Until when the pose of a frame that has just arrived is due; `None` in lockstep.
+    /// When the pose of a frame that has just arrived is due; `None` in lockstep.
     fn deadline_nanos(&self, arrival_nanos: i64) -> Option<i64> {
         let allowed_nanos = match self.config.tracker.deadline_ms {
             0.0 => self.order.period_nanos() / 2,
@@ -232,7 +232,7 @@ impl<'a> Shell<'a> {
         (self.mode == Mode::Live).then(|| arrival_nanos.saturating_add(allowed_nanos))
     }
 
-    /// Counts what is missing or out of order; whether the frame is to be used.
+    /// Counts missing and out-of-order frames; returns whether the frame is to be used.
     fn is_in_order(&mut self, header: &FrameHeader) -> bool {
         let arrival = self.order.arrive(header);
         let counters = self.health.counters();
@@ -244,7 +244,7 @@ impl<'a> Shell<'a> {
         arrival != FrameOrderOutcome::Repeated
     }
 
-    /// Live: says it when frames have stopped coming. The next frame ends the state.
+    /// Live: reports when frames have stopped. The next frame ends the state.
     fn look_for_silence(&mut self) {
         let periods = self.config.tracker.stale_periods;
         if self.mode == Mode::Live && self.order.is_silent(self.last_arrival_nanos, periods) {
@@ -281,7 +281,7 @@ impl<'a> Shell<'a> {
         };
         let mut message = pose_message(estimate, &timing);
         if pose_from_message(&message).is_err() {
-            // Nothing non-finite leaves this process.
+            // No non-finite value leaves this process.
             self.health.counters().refused += 1;
             message = pose_message(&unclaimed(estimate), &timing);
         }
@@ -294,13 +294,13 @@ impl<'a> Shell<'a> {
         counters.detail = codes_from_state(estimate.state).0;
         let late = deadline_nanos.is_some_and(|deadline| published_nanos > deadline);
         counters.deadline_misses += u64::from(late);
-        // A report that goes out at once has the frame in it.
+        // A report sent at once includes the frame.
         self.health.enter(ProcessState::Running, state_text(estimate.state));
         Ok(())
     }
 }
 
-/// A state and its reason, for whoever looks on.
+/// A state and its reason, for display.
 fn state_text(state: TrackingState) -> &'static str {
     match state {
         TrackingState::Initializing => "initializing: there is no trusted map yet",
@@ -324,7 +324,7 @@ fn state_text(state: TrackingState) -> &'static str {
     }
 }
 
-/// The same frame, lost, without a number that could be broken.
+/// The same frame, lost, without any number that could be invalid.
 fn unclaimed(estimate: &PoseEstimate) -> PoseEstimate {
     let identity = crate::slam::geometry::se3::SE3::identity();
     let mut covariance = [0.0; 21];

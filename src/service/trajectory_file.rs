@@ -1,7 +1,7 @@
 //! Trajectory files: TUM (`timestamp tx ty tz qx qy qz qw`) in and out, EuRoC ground truth in.
 //!
-//! Stamps are nanoseconds as integers and numbers have as many digits as bring the same bits back,
-//! so that two runs can be compared byte by byte.
+//! Stamps are nanoseconds as integers and numbers have enough digits to restore the same bits, so that two runs can be
+//! compared byte by byte.
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -11,10 +11,10 @@ use crate::service::atomic_file::write_atomically;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::trajectory::{EpochPose, StampedPose};
 
-/// Largest file that is read: 18 hours of poses at 30 Hz. A larger one is no trajectory.
+/// Largest file that is read, bytes: 18 hours of poses at 30 Hz. A larger one is not a trajectory.
 const MAX_FILE_BYTES: u64 = 256 << 20;
 
-/// What stands before an epoch's number in the comment that marks its beginning; a colon follows.
+/// Text before an epoch's number in the comment that marks its beginning; a colon follows.
 const EPOCH_MARK: &str = "# epoch ";
 
 const NANOS_PER_SEC: i64 = 1_000_000_000;
@@ -29,10 +29,10 @@ pub enum TrajectoryFileError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
-    /// A line that is no pose.
+    /// A line is not a pose.
     #[error("{path}:{line}: {fault}")]
     Line {
         /// The file.
@@ -42,7 +42,7 @@ pub enum TrajectoryFileError {
         /// What is wrong.
         fault: LineFault,
     },
-    /// A file without a pose.
+    /// The file has no pose.
     #[error("{path} has no poses: expected lines 'timestamp tx ty tz qx qy qz qw'")]
     Empty {
         /// The file.
@@ -53,10 +53,10 @@ pub enum TrajectoryFileError {
 /// What is wrong with a line.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum LineFault {
-    /// Bytes that are no text.
+    /// Its bytes are not text.
     #[error("not text: expected 'timestamp tx ty tz qx qy qz qw'")]
     NotText,
-    /// Another number of columns.
+    /// The number of columns is wrong.
     #[error("{found} columns, expected {expected}")]
     Columns {
         /// Columns found.
@@ -64,30 +64,30 @@ pub enum LineFault {
         /// Columns expected, in words.
         expected: &'static str,
     },
-    /// A column that is no finite number.
+    /// A column is not a finite number.
     #[error("'{0}' is not a finite number")]
     Number(String),
-    /// A stamp that does not fit into 64 bits of nanoseconds.
+    /// A stamp does not fit into 64 bits of nanoseconds.
     #[error("'{0}' is not a timestamp in {1}")]
     Stamp(String, &'static str),
-    /// Earlier than the line before.
+    /// It is earlier than the previous line.
     #[error("timestamp {0} is earlier than the one before: sort the file by time")]
     Order(String),
-    /// A quaternion without a direction.
+    /// Its quaternion has no direction.
     #[error("the quaternion has no length: expected qx qy qz qw of length 1")]
     Quaternion,
 }
 
-/// A trajectory as a file holds it.
+/// The contents of a trajectory file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrajectoryFile {
-    /// Its poses, in order of their stamps, all of epoch 0 where it marks none.
+    /// Its poses, ordered by stamp, all of epoch 0 where it marks none.
     pub poses: Vec<EpochPose>,
-    /// Whether it is in EuRoC's layout, whose poses are those of the body that carries the camera.
+    /// Whether it is in EuRoC's layout, with poses of the body that carries the camera.
     pub is_euroc: bool,
 }
 
-/// The poses of a file, of whatever epochs, in order of their stamps; see [`read_trajectory_file`].
+/// The poses of a file, of any epoch, ordered by stamp; see [`read_trajectory_file`].
 pub fn read_trajectory(path: &Path) -> Result<Vec<StampedPose>, TrajectoryFileError> {
     Ok(read_trajectory_file(path)?.poses.into_iter().map(|of| of.pose).collect())
 }
@@ -113,8 +113,8 @@ pub fn read_trajectory_file(path: &Path) -> Result<TrajectoryFile, TrajectoryFil
     Ok(TrajectoryFile { poses, is_euroc: first.is_some_and(|line| line.contains(&b',')) })
 }
 
-/// The poses of a file's bytes, or the line (from 1) that is at fault. Comments but the marks of [`write_epochs`] mean
-/// nothing.
+/// Parses the poses in a file's bytes; the error has the faulty line, from 1. Comments except the marks of
+/// [`write_epochs`] are ignored.
 pub fn parse_trajectory(bytes: &[u8]) -> Result<Vec<EpochPose>, (usize, LineFault)> {
     let mut poses: Vec<EpochPose> = Vec::new();
     let mut epoch = 0;
@@ -135,7 +135,7 @@ pub fn parse_trajectory(bytes: &[u8]) -> Result<Vec<EpochPose>, (usize, LineFaul
     Ok(poses)
 }
 
-/// The epoch that a comment marks the beginning of.
+/// The epoch whose beginning a comment marks.
 fn epoch_mark(line: &str) -> Option<u32> {
     let (digits, _) = line.strip_prefix(EPOCH_MARK)?.split_once(':')?;
     let is_number = digits.bytes().all(|b| b.is_ascii_digit());
@@ -180,7 +180,7 @@ fn parse_finite(column: &str) -> Result<f64, LineFault> {
     number.filter(|n| n.is_finite()).ok_or_else(|| LineFault::Number(shortened(column)))
 }
 
-/// At most the first characters of a column: a message stays one readable line.
+/// The first characters of a column, so that a message stays one readable line.
 fn shortened(column: &str) -> String {
     const LONGEST: usize = 40;
     if column.chars().count() <= LONGEST {
@@ -225,7 +225,7 @@ pub fn secs_from_nanos(nanos: i64) -> String {
     format!("{sign}{}.{:09}", magnitude / per_sec, magnitude % per_sec)
 }
 
-/// One pose as a TUM line without its end: the shortest digits that bring the same bits back.
+/// One pose as a TUM line without its end: the shortest digits that restore the same bits.
 pub fn tum_line(pose: &StampedPose) -> String {
     let t = &pose.world_from_camera.translation;
     let [qx, qy, qz, qw] = pose.world_from_camera.quaternion_xyzw();
@@ -240,7 +240,7 @@ pub fn write_trajectory(path: &Path, comment: &str, poses: &[StampedPose]) -> io
     })
 }
 
-/// Writes what [`write_trajectory`] does; of several epochs each begins with a comment, `# epoch N: …`.
+/// As [`write_trajectory`], with a comment, `# epoch N: …`, before each of several epochs.
 pub fn write_epochs(path: &Path, comment: &str, poses: &[EpochPose]) -> io::Result<()> {
     let is_one = poses.windows(2).all(|pair| pair[0].epoch == pair[1].epoch);
     write_atomically(path, |file| {
@@ -280,7 +280,7 @@ mod tests {
             ("1.305031102175304e+09", 1_305_031_102_175_304_000),
         ] {
             let read = nanos_from_secs(text).unwrap();
-            // Only what went through f64 may round: to 2⁻²² s at today's stamps.
+            // Only a stamp that went through f64 may be rounded: to 2⁻²² s at today's stamps.
             assert!((read - nanos).abs() <= if text.contains('e') { 256 } else { 0 }, "{text}");
         }
         for text in ["", ".", "-", "1.2.3", "nan", "inf", "9e99", "99999999999999999999", "1,5"] {
@@ -296,8 +296,8 @@ mod tests {
 
         #[test]
         fn a_line_is_a_fixed_point(xi in proptest::array::uniform6(-3.0f64..3.0), nanos in 0i64..i64::MAX) {
-            // The reader may change the last bit of a quaternion when it normalises it; the
-            // translation and the stamp come back as they are.
+            // The reader may change the last bit of a quaternion when it normalises it; translation and stamp are read
+            // back unchanged.
             let pose = StampedPose { nanos, world_from_camera: SE3::exp(&Vector6::from(xi)) };
             let read = parse_pose(&tum_line(&pose)).unwrap();
             prop_assert_eq!(read.nanos, pose.nanos);
@@ -324,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn poses_have_the_epoch_that_was_marked_last() {
+    fn poses_belong_to_the_epoch_marked_last() {
         let at = |secs: i64, epoch| {
             let pose =
                 StampedPose { nanos: secs * NANOS_PER_SEC, world_from_camera: SE3::identity() };
@@ -335,7 +335,7 @@ mod tests {
             write_epochs(file.path(), "c", &poses).unwrap();
             assert_eq!(read_trajectory_file(file.path()).unwrap().poses, poses);
         }
-        // Nothing else is a mark; what stands before the first is of epoch 0.
+        // Nothing else is a mark; poses before the first are of epoch 0.
         let pose = "0 0 0 0 0 0 1\n";
         for (comment, epoch) in [
             ("# epoch 7: x", 7),

@@ -1,4 +1,4 @@
-//! The live page beside a run: one more process, whose death the run does not notice.
+//! The live page alongside a run: one more process, whose death does not affect the run.
 
 use std::ffi::OsString;
 use std::io::{self, Write};
@@ -13,16 +13,16 @@ use crate::service::child::{command, forward_lines};
 use crate::service::clock::wait_at_most;
 use crate::service::error_log::ErrorLog;
 
-/// Pause before it is started again.
+/// Pause before a restart.
 const RESTART_PAUSE: Duration = Duration::from_secs(10);
-/// How often it is started again: what fails more often will not come right.
+/// Most restarts: a process that fails more often will not recover.
 const MOST_RESTARTS: u32 = 3;
-/// How long it may take to end when it is asked to: one that is stopped never does.
+/// Longest wait for its end on request: a stopped process never ends.
 const LONGEST_END: Duration = Duration::from_millis(500);
 /// Addresses that wait to be printed.
 const WAITING_LINES: usize = 4;
 
-/// What starts it.
+/// How to start it.
 #[derive(Debug, Clone)]
 pub struct ViewOptions {
     /// `semidense-bridge`.
@@ -31,7 +31,7 @@ pub struct ViewOptions {
     pub arguments: Vec<OsString>,
     /// Folder of the instance.
     pub root: PathBuf,
-    /// Where its log goes.
+    /// Receives its log.
     pub log: ErrorLog,
 }
 
@@ -51,7 +51,7 @@ impl ViewChild {
         Ok(Self { options, running, ended: None, restarts: 0 })
     }
 
-    /// Looks after it, and gives the address that it has printed, once.
+    /// Restarts it when due, and returns the address that it has printed, once.
     pub fn look(&mut self) -> Option<String> {
         let Some((child, lines)) = &mut self.running else {
             let is_due = self.ended.is_some_and(|ended| ended.elapsed() >= RESTART_PAUSE);

@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_record_comes_back_from_its_message_and_a_broken_one_is_refused() {
+    fn a_record_survives_its_message_and_an_invalid_message_is_refused() {
         for fate in Fate::ALL {
             let record = AdjustmentRecord {
                 sequence: 1,

@@ -1,4 +1,4 @@
-//! Pieces of a pass over all keyframes between the estimates of new ones.
+//! Pieces of a pass over all keyframes, between the estimates of new ones.
 
 use std::sync::mpsc::channel;
 
@@ -10,7 +10,7 @@ use crate::slam::mapper::MapperParams;
 use crate::slam::mapper::reuse::ReuseParams;
 use crate::slam::window::params::WindowParams;
 
-/// Passes without end, in pieces of three, from the third keyframe on.
+/// Endless passes, in pieces of three, from the third keyframe on.
 fn with_passes() -> MapperParams {
     let window = WindowParams {
         num_free: 2,
@@ -25,7 +25,7 @@ fn with_passes() -> MapperParams {
 }
 
 #[test]
-fn a_new_keyframe_goes_first_and_waits_for_one_piece_at_most() {
+fn a_new_keyframe_goes_first_and_waits_for_at_most_one_piece() {
     let (say, begun) = channel();
     let optimise = move |window: &mut Window| {
         say.send(window.is_piece()).unwrap();
@@ -63,7 +63,7 @@ fn a_piece_moves_the_map_and_odometry_does_not_jump() {
     while adjustments.away.is_some() {
         adjustments.after_frame(&mut walk.mapper, walk.frames);
     }
-    // A keyframe in the middle is out of line.
+    // Move a keyframe in the middle out of line.
     let bent = walk.mapper.map().get(1).unwrap();
     let right = bent.map_from_keyframe.rigid.translation;
     let mut map_from_keyframe = bent.map_from_keyframe;

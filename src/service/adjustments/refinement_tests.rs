@@ -1,17 +1,17 @@
-//! Depth that is refined while frames come.
+//! Depth that is refined while frames arrive.
 
 use super::tests::{Walk, start, until};
 use super::*;
 use crate::slam::mapper::MapperParams;
 use crate::slam::window::params::WindowParams;
 
-/// Two keyframes free: the third before the newest has settled.
+/// Two free keyframes: the third before the newest has settled.
 fn short_window() -> MapperParams {
     let window = WindowParams { num_first: 2, num_free: 2, ..WindowParams::default() };
     MapperParams { window, ..MapperParams::default() }
 }
 
-/// 19 frames with five keyframes, each estimate in the map before the next frame.
+/// 19 frames with five keyframes; live, each estimate is in the map before the next frame.
 fn walk(entry: Entry) -> (Walk, Vec<u64>) {
     let mut adjustments = start(entry, Box::new(Window::optimise));
     let mut walk = Walk::with(short_window());
@@ -33,7 +33,7 @@ fn refined(walk: &Walk) -> Vec<u64> {
 }
 
 #[test]
-fn keyframes_that_have_settled_are_refined_and_told_of() {
+fn settled_keyframes_are_refined_and_reported() {
     let (live, left) = walk(Entry::WhenReady);
     assert_eq!(live.mapper.map().keyframes.len(), 5);
     assert_eq!(refined(&live), [0, 1, 2]);
@@ -45,7 +45,7 @@ fn keyframes_that_have_settled_are_refined_and_told_of() {
     assert!(refined(&lockstep).is_empty(), "there it is done after the last frame");
     let points = |walk: &Walk| walk.mapper.map().get(1).unwrap().points.clone();
     assert_ne!(points(&live), points(&lockstep));
-    // Poses are exact here, so that the filter's depth is as good: 0.2 %.
+    // Poses are exact here, so the filter's depth is as good: 0.2 %.
     let mut errors = live.depth_errors(1);
     errors.sort_by(f64::total_cmp);
     assert!(errors[errors.len() / 2] < 0.005, "{}", errors[errors.len() / 2]);

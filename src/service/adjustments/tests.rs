@@ -1,4 +1,4 @@
-//! Estimates that are fast, slow, late, of another map, or that panic.
+//! Estimates that are fast, slow, late, for another map, or that panic.
 
 use std::sync::mpsc::{Receiver, Sender, channel};
 
@@ -15,8 +15,7 @@ use crate::slam::test_scene::{CAMERA, Scene};
 /// Frames between two keyframes.
 pub(super) const KEYFRAME_INTERVAL: u64 = 4;
 
-/// A camera that moves sideways, with exact poses, depth for its first keyframe, and a keyframe at every
-/// fourth frame.
+/// A camera moving sideways, with exact poses, depth for its first keyframe, and a keyframe every fourth frame.
 pub(super) struct Walk {
     scene: Scene,
     pub(super) mapper: Mapper,
@@ -33,7 +32,7 @@ impl Walk {
         Self { scene: Scene::new(3), mapper, frames: 0 }
     }
 
-    /// The next frame, without what follows it.
+    /// Maps the next frame, without the joint estimation that follows it.
     fn step(&mut self) -> StepOutcome {
         let k = self.frames;
         self.frames += 1;
@@ -59,7 +58,7 @@ impl Walk {
         outcome
     }
 
-    /// The next frame; what the joint estimation did with it.
+    /// Maps the next frame; returns the outcome of the joint estimation.
     pub(super) fn go(&mut self, adjustments: &mut Adjustments) -> StepOutcome {
         let sequence = self.frames;
         self.step();
@@ -90,7 +89,7 @@ pub(super) fn start(entry: Entry, optimise: Optimise) -> Adjustments {
     Adjustments::start_with(entry, Background::Other, optimise).unwrap()
 }
 
-/// An optimisation that begins when it is let go, and the means to let it go.
+/// An optimisation that waits until it is released, and the sender that releases it.
 fn held() -> (Optimise, Sender<()>) {
     let (let_go, wait): (Sender<()>, Receiver<()>) = channel();
     let optimise = move |window: &mut Window| {
@@ -120,7 +119,7 @@ fn an_estimate_enters_at_its_frame_however_long_it_took() {
         let mut records = Vec::new();
         for _ in 0..14 {
             walk.go(&mut adjustments);
-            // A thread that is at once done gets the time to be.
+            // Gives a fast thread the time to finish.
             std::thread::sleep(Duration::from_millis(20));
             records.extend(adjustments.take_records());
         }
@@ -148,7 +147,7 @@ fn live_no_frame_waits_and_a_late_estimate_is_merged() {
     let (optimise, let_go) = held();
     let mut adjustments = start(Entry::WhenReady, optimise);
     let mut walk = Walk::new();
-    // The first keyframe alone says nothing: it comes back at once.
+    // The first keyframe alone holds nothing to estimate: it comes back at once.
     let_go.send(()).unwrap();
     for _ in 0..=9 {
         assert!(!walk.go(&mut adjustments).graph_changed, "nothing was estimated yet");
@@ -156,7 +155,7 @@ fn live_no_frame_waits_and_a_late_estimate_is_merged() {
     assert_eq!(walk.mapper.map().keyframes.len(), 3);
     let before = walk.places();
     let_go.send(()).unwrap();
-    // No frame comes.
+    // No frame arrives.
     until(|| adjustments.pick_up(&mut walk.mapper).needs_publishing());
     let record = adjustments.take_records().last().unwrap();
     assert_eq!(record.fate, Fate::Merged, "{record:?}");
@@ -170,7 +169,7 @@ fn live_no_frame_waits_and_a_late_estimate_is_merged() {
 }
 
 #[test]
-fn the_checkpoint_has_the_correction_and_the_depth_that_goes_with_it() {
+fn the_checkpoint_holds_the_correction_and_its_depth() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("rig.checkpoint");
     let (Some(mut kept), None) = Kept::open(&path) else { panic!("an empty folder") };
@@ -183,7 +182,7 @@ fn the_checkpoint_has_the_correction_and_the_depth_that_goes_with_it() {
         let adjusted = adjustments.after_frame(&mut walk.mapper, sequence);
         kept.follow(&mut walk.mapper, &adjusted);
     }
-    // The last frame's correction, killed before the next.
+    // Killed after the last frame's correction, before the next frame.
     let map = walk.mapper.map();
     assert_eq!(map.keyframes.len(), 3);
     until(|| {
@@ -229,7 +228,7 @@ fn an_estimate_of_a_map_that_was_corrected_meanwhile_is_dropped() {
 }
 
 #[test]
-fn an_estimate_for_a_camera_that_is_gone_is_dropped() {
+fn an_estimate_for_a_replaced_camera_is_dropped() {
     let mut adjustments = start(Entry::AfterFrames(2), Box::new(Window::optimise));
     let mut walk = Walk::new();
     for _ in 0..=4 {
@@ -245,7 +244,7 @@ fn an_estimate_for_a_camera_that_is_gone_is_dropped() {
 }
 
 #[test]
-fn a_panic_is_said_once_and_mapping_continues() {
+fn a_panic_is_reported_once_and_mapping_continues() {
     let panics = |_: &mut Window| -> Option<Adjustment> { panic!("a broken estimate") };
     for entry in [Entry::AfterFrames(1), Entry::WhenReady] {
         let mut adjustments = start(entry, Box::new(panics));
@@ -265,7 +264,7 @@ fn a_panic_is_said_once_and_mapping_continues() {
 
 #[test]
 fn the_last_keyframe_is_estimated_before_the_end() {
-    // The estimate before it is still away then.
+    // The previous estimate is still in flight then.
     for entry in [Entry::AfterFrames(6), Entry::WhenReady] {
         let pauses = |window: &mut Window| {
             std::thread::sleep(Duration::from_millis(200));
@@ -288,7 +287,7 @@ fn the_end_does_not_wait_long_for_a_thread_without_cpu() {
     let mut adjustments = start(Entry::WhenReady, optimise);
     Walk::new().go(&mut adjustments);
     assert!(adjustments.away.is_some());
-    // It returns, though the estimate never comes back.
+    // It returns although the estimate never comes back.
     drop(adjustments);
     drop(let_go);
 }

@@ -1,4 +1,4 @@
-//! The thread that keyframes are estimated jointly on.
+//! The thread for joint estimation of keyframes.
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -12,23 +12,23 @@ use rustix::time::{ClockId, clock_gettime};
 use crate::service::schedule::{Background, apply_background};
 use crate::slam::window::{Adjustment, Window};
 
-/// Longest wait for the estimate that is away when the process ends: what is stopped must end at once, and the thread has
-/// nothing but memory that ends with the process.
+/// Longest wait for the estimate in flight when the process ends: a process told to stop must end at once, and the
+/// thread holds nothing but memory, which ends with the process.
 const JOIN_TIMEOUT: Duration = Duration::from_millis(20);
 
-/// What estimates a window: [`Window::optimise`], or what a test puts in its place.
+/// Estimates a window: [`Window::optimise`], or a test's replacement.
 pub(super) type Optimise = Box<dyn FnMut(&mut Window) -> Option<Adjustment> + Send>;
 
-/// A window that comes back.
+/// A window that has come back.
 pub(super) struct Finished {
     pub window: Box<Window>,
-    /// `None` where there was too little to be estimated.
+    /// `None` where there was too little to estimate.
     pub adjustment: Option<Adjustment>,
-    /// CPU time that it took.
+    /// CPU time it took.
     pub nanos: u64,
 }
 
-/// One window at a time goes there and comes back.
+/// Sends one window at a time to the thread and receives it back.
 pub(super) struct AdjustmentThread {
     windows: Option<SyncSender<Box<Window>>>,
     finished: Receiver<Finished>,
@@ -54,7 +54,7 @@ impl AdjustmentThread {
                 if back.send(Finished { window, adjustment, nanos }).is_err() {
                     return;
                 }
-                // Full only where nobody has looked for 2⁶⁴ windows.
+                // Full only after 2⁶⁴ windows that were never fetched.
                 let _ = rustix::io::write(&waker, &1_u64.to_ne_bytes());
             }
         };
@@ -62,27 +62,27 @@ impl AdjustmentThread {
         Ok(Self { windows: Some(windows), finished, wake, thread: Some(thread) })
     }
 
-    /// Hands a window over, when the one before has come back.
+    /// Hands a window over; the previous one must have come back.
     pub fn hand_over(&self, window: Box<Window>) {
         if let Some(windows) = &self.windows {
-            // A thread that has ended is noticed when the window is asked for.
+            // A thread that has ended is noticed when the window is waited for.
             drop(windows.try_send(window));
         }
     }
 
-    /// The window that was handed over, where it comes back within `timeout`; disconnected where the thread has panicked.
+    /// Waits up to `timeout` for the window that was handed over; disconnected where the thread has panicked.
     pub fn wait_at_most(&self, timeout: Duration) -> Result<Finished, RecvTimeoutError> {
         let mut counted = [0; size_of::<u64>()];
         let _ = rustix::io::read(&self.wake, &mut counted);
         self.finished.recv_timeout(timeout)
     }
 
-    /// Readable when a window has come back and was not asked for since.
+    /// Readable when a window has come back and has not been waited for since.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.wake.as_fd()
     }
 
-    /// What the thread said when it panicked; empty where it did not.
+    /// The thread's panic message; empty where it did not panic.
     pub fn panic_message(mut self) -> String {
         let Some(Err(cause)) = self.thread.take().map(JoinHandle::join) else {
             return String::new();
@@ -96,7 +96,7 @@ impl Drop for AdjustmentThread {
     fn drop(&mut self) {
         self.windows = None;
         let Some(thread) = self.thread.take() else { return };
-        // The window that is away comes back, then the channel ends with the thread.
+        // The window in flight comes back, then the channel closes with the thread.
         while self.finished.recv_timeout(JOIN_TIMEOUT).is_ok() {}
         if matches!(self.finished.try_recv(), Err(TryRecvError::Disconnected)) {
             // A panic has been reported where it happened.
@@ -105,7 +105,7 @@ impl Drop for AdjustmentThread {
     }
 }
 
-/// Time that the calling thread has computed.
+/// CPU time of the calling thread.
 fn cpu_nanos() -> u64 {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     let (secs, nanos) = (u64::try_from(time.tv_sec), u64::try_from(time.tv_nsec));

@@ -1,14 +1,14 @@
 //! The two parts of a configuration file: keys that a user may want at the top, all others below `[expert]`.
 //!
-//! `expert.` belongs to the file, not to the program: a key is the same with and without it. A key that moves from one
-//! part to the other breaks no file and no script, and each algorithm keeps its parameters in one struct.
+//! `expert.` belongs to the file, not to the program: a key is the same with and without it. Moving a key from one part
+//! to the other breaks no file and no script, and each algorithm keeps its parameters in one struct.
 
 use std::ops::Range;
 
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-/// The table that holds what nobody has to set.
+/// The table of keys that nobody has to set.
 pub const EXPERT: &str = "expert";
 
 /// Keys outside `[expert]`: what a camera, a robot, a recording or a first try may need.
@@ -57,7 +57,7 @@ const USER_KEYS: [&str; 42] = [
     "simulator.motion.mean_speed_m_s",
 ];
 
-/// Keys that were replaced, and what by: one model of the camera's noise by what each algorithm had of its own.
+/// Replaced keys and their replacements: one model of the camera's noise instead of one per algorithm.
 const MOVED_KEYS: [(&str, &str); 5] = [
     ("tracking.alignment.pixel_noise", "noise.pixel_std_dev"),
     ("tracking.alignment.model_noise", "noise.model_std_dev"),
@@ -66,12 +66,12 @@ const MOVED_KEYS: [(&str, &str); 5] = [
     ("mapping.two_frame.fit.image_noise", "noise.pixel_std_dev"),
 ];
 
-/// What is wrong with the two parts of a file.
+/// An error in the two parts of a file.
 #[derive(Debug, PartialEq, Eq)]
 pub struct LayoutError {
-    /// What.
+    /// What is wrong.
     pub reason: String,
-    /// Bytes of the text that it is about.
+    /// Byte range of the text that it refers to.
     pub span: Range<usize>,
 }
 
@@ -85,12 +85,12 @@ pub fn plain(key: &str) -> &str {
     key.strip_prefix(EXPERT).and_then(|rest| rest.strip_prefix('.')).unwrap_or(key)
 }
 
-/// What has replaced the dotted `key`, as the shipped file lists it; `None` of one that is in use or never was.
+/// The replacement of the dotted `key`, as the shipped file lists it; `None` for one in use or one that never existed.
 pub fn moved(key: &str) -> Option<String> {
     MOVED_KEYS.iter().find(|(before, _)| *before == key).map(|(_, now)| listed(now))
 }
 
-/// Refuses a key that was replaced, in a table without `[expert]`, and says by which.
+/// Refuses a replaced key, in a table without `[expert]`, and names its replacement.
 pub fn find_moved(root: &DeTable) -> Result<(), LayoutError> {
     for (before, now) in MOVED_KEYS {
         let mut keys = before.split('.');
@@ -104,7 +104,7 @@ pub fn find_moved(root: &DeTable) -> Result<(), LayoutError> {
     Ok(())
 }
 
-/// Moves what stands below `[expert]` to its place without it. A key that stands in both places is an error.
+/// Moves keys below `[expert]` to their place without it. A key in both places is an error.
 pub fn merge(root: &mut DeTable) -> Result<(), LayoutError> {
     let Some(expert) = root.remove(EXPERT) else { return Ok(()) };
     let span = expert.span();
@@ -139,7 +139,7 @@ fn merge_into<'a>(
     Ok(())
 }
 
-/// The `flat` table of all keys in two parts, as in the shipped file.
+/// Splits the `flat` table of all keys into two parts, as in the shipped file.
 pub fn split(flat: Table) -> Table {
     let mut expert = Table::new();
     let mut user = split_table(flat, "", &mut expert);
@@ -147,7 +147,7 @@ pub fn split(flat: Table) -> Table {
     user
 }
 
-/// Takes the keys of `table` that are not a user's into `expert`, and gives what is left.
+/// Moves the keys of `table` that are not a user's into `expert` and returns the rest.
 fn split_table(table: Table, prefix: &str, expert: &mut Table) -> Table {
     let mut user = Table::new();
     for (key, value) in table {

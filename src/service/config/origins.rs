@@ -1,4 +1,4 @@
-//! Which value each key has, and where it comes from.
+//! The value of each key, and where it comes from.
 
 use std::path::{Path, PathBuf};
 
@@ -9,7 +9,7 @@ use crate::service::config::{Config, ConfigError, apply, layout};
 /// Where a value comes from.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Origin {
-    /// The program's own.
+    /// Built into the program.
     BuiltIn,
     /// The configuration file.
     File(PathBuf),
@@ -24,16 +24,16 @@ pub struct KeyInForce {
     pub key: String,
     /// Its value as TOML.
     pub value: String,
-    /// The program's own value where this is another one.
+    /// The built-in value, where it differs.
     pub built_in: Option<String>,
     /// Where it comes from.
     pub origin: Origin,
-    /// Whether it stands below `[expert]`.
+    /// Whether it is below `[expert]`.
     pub is_expert: bool,
 }
 
 impl Config {
-    /// Every key that [`Config::load`] of the same file and settings gives, in the order of the shipped file.
+    /// Every key as [`Config::load`] gives it for the same file and settings, in the order of the shipped file.
     pub fn keys_in_force(
         file: Option<&Path>,
         settings: &[String],
@@ -74,7 +74,7 @@ impl Config {
     }
 }
 
-/// The dotted keys of `table` and what is below them.
+/// Collects the dotted keys in `table` and its subtables, with their values.
 fn flatten(table: &Table, prefix: &str, keys: &mut Vec<(String, String)>) {
     for (key, value) in table {
         match value {
@@ -99,7 +99,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_key_says_where_its_value_comes_from() {
+    fn every_key_has_the_origin_of_its_value() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("robot.toml");
         std::fs::write(&path, "[mapper]\nthreads = 3\n[expert.mapping]\nmin_gradient = 6.5\n")

@@ -1,4 +1,4 @@
-//! The configuration against its shipped file, and what is wrong said in one line.
+//! The configuration against its shipped file, and errors in one line.
 
 use super::*;
 use crate::slam::image::noise::ImageNoise;
@@ -41,7 +41,7 @@ fn the_shipped_file_lists_every_key_with_its_default() {
 }
 
 #[test]
-fn presets_load_and_change_what_they_name() {
+fn presets_load_and_change_every_key_they_name() {
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/config/presets");
     let mut num_presets = 0;
     for entry in std::fs::read_dir(folder).unwrap() {
@@ -51,7 +51,7 @@ fn presets_load_and_change_what_they_name() {
         for key in keys.iter().filter(|key| key.origin == Origin::File(path.clone())) {
             assert!(!key.is_expert, "{}: {} is an expert's", path.display(), key.key);
             named += 1;
-            // Priorities stand beside their policy for the reader.
+            // Priorities are listed next to their policy for the reader.
             if key.built_in.is_none() && !key.key.ends_with(".priority") {
                 same.push(&key.key);
             }
@@ -83,7 +83,7 @@ fn a_key_is_the_same_with_and_without_expert() {
     let told = "x.toml:2: `min_gradient = 4.0`: `mapping.min_gradient` is also given as \
                 `expert.mapping.min_gradient`: keep one";
     assert_eq!(error, told);
-    // What comes later wins, whichever way it is written.
+    // The later setting wins, whichever way it is written.
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.toml");
     std::fs::write(&path, "[expert.mapping]\nmin_gradient = 6.0\n").unwrap();
@@ -92,7 +92,7 @@ fn a_key_is_the_same_with_and_without_expert() {
         assert_eq!(config.mapping.min_gradient, 7.0, "{setting}");
     }
     assert_eq!(Config::load(Some(&path), &[]).unwrap().mapping.min_gradient, 6.0);
-    // The configuration as text is read back as what it was.
+    // The configuration's text reads back unchanged.
     assert_eq!(read(&expected.to_text()).unwrap(), expected);
 }
 
@@ -118,7 +118,7 @@ fn errors_below_expert_name_line_and_listed_key() {
 }
 
 #[test]
-fn tracker_and_mapper_agree_on_how_far_a_keyframe_is() {
+fn tracker_and_mapper_agree_on_keyframe_distance() {
     let mut expected = DistanceWeights::default();
     assert_eq!(Config::default().mapping.reuse.distance, expected);
     expected.translation = 2.0;
@@ -128,14 +128,14 @@ fn tracker_and_mapper_agree_on_how_far_a_keyframe_is() {
 }
 
 #[test]
-fn later_words_win() {
+fn later_settings_win() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("semidense.toml");
     let text = "instance = \"rig2\"\n[mapper]\nthreads = 3\n[capture]\nrig = \"cam.toml\"\n";
     std::fs::write(&path, text).unwrap();
     let config = Config::load(Some(&path), &["mapper.threads=1".to_owned()]).unwrap();
     assert_eq!((config.instance.as_str(), config.mapper.threads), ("rig2", 1));
-    // A path in a file is the file's, one on the command line is not.
+    // A path in a file is relative to that file, one on the command line is not.
     assert_eq!(Path::new(&config.capture.rig), folder.path().join("cam.toml"));
     let config = Config::load(Some(&path), &["capture.rig=x.toml".to_owned()]).unwrap();
     assert_eq!(config.capture.rig, "x.toml");
@@ -201,7 +201,7 @@ fn bad_settings_are_refused() {
 }
 
 #[test]
-fn the_noise_of_the_camera_is_the_same_for_all_and_what_it_replaced_is_told() {
+fn the_camera_noise_is_shared_and_replaced_keys_are_named() {
     let config = set(&["noise.pixel_std_dev=2.0", "expert.noise.model_std_dev=5.0"]).unwrap();
     let noise = ImageNoise { pixel_std_dev: 2.0, model_std_dev: 5.0 };
     let (tracking, mapping) = (&config.tracking, &config.mapping);
@@ -225,13 +225,13 @@ fn the_noise_of_the_camera_is_the_same_for_all_and_what_it_replaced_is_told() {
 }
 
 #[test]
-fn the_shipped_file_says_what_every_number_may_be() {
+fn the_shipped_file_documents_the_range_of_every_number() {
     let text = include_str!("../../../config/semidense.toml");
     let mut all = Vec::new();
     keys(&text.parse().unwrap(), "", &mut all);
     let mut checked = 0;
     for (key, value) in all {
-        // Too large, too small: one of them is refused with what is allowed.
+        // Too large, too small: one of them is refused, naming what is allowed.
         let wrong: &[&str] = match value {
             Value::Float(_) => &["1e30", "-1e30"],
             Value::Integer(_) => &["100000000", "255", "0"],

@@ -1,5 +1,5 @@
-//! What `doctor` says of cameras: which there are, whether this user and the services' user may open them,
-//! who uses them.
+//! `doctor`'s findings on cameras: which exist, whether this user and the services' user may open them, and which
+//! processes use them.
 
 use std::fs;
 use std::path::Path;
@@ -13,7 +13,7 @@ const SERVICE_USER: &str = "semidense";
 const VIDEO_GROUP: &str = "video";
 
 impl Machine {
-    /// One finding for each camera; one that there is none.
+    /// One finding per camera, or one that there is none.
     pub(super) fn cameras(&self) -> Vec<Finding> {
         const SUBJECT: &str = "cameras";
         let found = nodes(&self.root.join("dev"));
@@ -63,7 +63,7 @@ impl Machine {
         }
     }
 
-    /// The process that has a node open, and its program's name, as far as this user may look.
+    /// The process that has a node open, and its program's name, as far as this user may see.
     fn holder(&self, path: &Path) -> Option<(u32, String)> {
         let processes = fs::read_dir(self.root.join("proc")).ok()?.flatten();
         let mut numbers: Vec<u32> = processes
@@ -100,12 +100,12 @@ impl Machine {
     }
 }
 
-/// Whether a camera can be used; `None` for what is none.
+/// Whether a camera can be used; `None` for a node that is not a camera.
 pub(super) fn camera_access(path: &Path) -> Option<Access> {
     crate::capture::v4l::listing::access(path)
 }
 
-/// What is asked of a node: it can be answered by a test.
+/// Checks a node; a test can replace it.
 pub(super) type CameraAccess = fn(&Path) -> Option<Access>;
 
 #[cfg(test)]
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_without_cameras_is_as_it_should_be() {
+    fn a_machine_without_cameras_is_ok() {
         let (_folder, machine) =
             machine(&[("dev/video-camera", ""), ("etc/group", "video:x:44:\n")]);
         let findings = machine.cameras();
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn the_services_user_may_be_where_it_belongs() {
+    fn the_services_user_may_be_in_the_video_group() {
         let (_folder, mut machine) = machine(&[
             ("dev/video0", ""),
             ("etc/passwd", "semidense:x:990:990::/:/bin/false\n"),

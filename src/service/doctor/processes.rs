@@ -1,5 +1,5 @@
-//! What `doctor` says of the processes that run: the limits that their units have given them. The doctor's
-//! own limits, most often a login's or root's, are not theirs.
+//! `doctor`'s findings on running processes: the limits set by their units. The doctor's own limits, most often those
+//! of a login or of root, do not apply to them.
 
 use std::fs;
 
@@ -10,7 +10,7 @@ use crate::service::schedule::Policy;
 /// The processes of a rig.
 const PROCESSES: [&str; 3] = ["capture", "tracker", "mapper"];
 
-/// A process of ours that runs.
+/// A running process of the rig.
 struct Running {
     number: u32,
     name: &'static str,
@@ -18,7 +18,7 @@ struct Running {
 }
 
 impl Running {
-    /// A soft limit by the kernel's name of it; `u64::MAX` for none.
+    /// A soft limit by its name in the kernel; `u64::MAX` where unlimited.
     fn limit(&self, name: &str) -> Option<u64> {
         let line = self.limits.lines().find(|line| line.starts_with(name))?;
         let word = line.get(name.len()..)?.split_whitespace().next()?;
@@ -27,7 +27,7 @@ impl Running {
 }
 
 impl Machine {
-    /// One finding for all processes that run, or one for each limit that is too low.
+    /// One finding for all running processes, or one for each limit that is too low.
     pub(super) fn processes(&self, config: &Config) -> Vec<Finding> {
         const SUBJECT: &str = "running processes";
         let running = self.running();
@@ -48,7 +48,7 @@ impl Machine {
         }
     }
 
-    /// Our processes, as far as this user may look, in the order of their numbers.
+    /// The rig's running processes, as far as this user may see, in the order of their ids.
     fn running(&self) -> Vec<Running> {
         let entries = fs::read_dir(self.root.join("proc")).into_iter().flatten().flatten();
         let mut found: Vec<Running> = entries
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_where_nothing_runs_is_no_fault() {
+    fn a_machine_without_running_processes_is_ok() {
         let (_folder, machine) = machine(&[]);
         assert_eq!(machine.processes(&Config::default())[0].found, "none");
     }

@@ -38,7 +38,7 @@ pub(super) fn deserialize<'a, D: Deserializer<'a>>(from: D) -> Result<OsString, 
     Path::deserialize(from).map(OsString::from)
 }
 
-/// The same where there may be none.
+/// The same for an optional path.
 pub(super) mod optional {
     use super::{Deserialize, Deserializer, OsString, Path, Serialize, Serializer};
 

@@ -1,4 +1,4 @@
-//! What the mapper publishes of its keyframes, for the journal: the newest revision of each.
+//! The keyframes that the mapper publishes, for the journal: the newest revision of each.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
@@ -11,11 +11,11 @@ use crate::wire::message::{GraphHeader, KeyframeHeader, KeyframeImageHeader, Key
 use crate::wire::port::{Hub, OpenError, ReceiveError, Subscriber};
 use crate::wire::topic::{GRAPH, KEYFRAME, KEYFRAME_IMAGE};
 
-/// Time between two states of the same keyframe in the journal: up to 2 MB each.
+/// Time between two writes of the same keyframe to the journal: up to 2 MB each.
 const PERIOD: Duration = Duration::from_millis(1500);
 
-/// Follows the mapper's keyframes. What waits for the journal is copied: the last depth of a keyframe is only known for it when
-/// that of the next comes, and a subscriber holds one message at a time.
+/// Follows the mapper's keyframes. Data that waits for the journal is copied: the last depth of a keyframe is only
+/// recognised when that of the next arrives, and a subscriber holds one message at a time.
 #[derive(Debug)]
 pub struct KeyframeFeed {
     depths: Subscriber<DepthPoint, KeyframeHeader>,
@@ -23,14 +23,14 @@ pub struct KeyframeFeed {
     graphs: Subscriber<KeyframePoseMessage, GraphHeader>,
     depth: Option<(KeyframeHeader, Vec<DepthPoint>)>,
     image: Option<(KeyframeImageHeader, Vec<u8>)>,
-    /// Revision that the journal has, and since when.
+    /// Revision in the journal, and since when.
     kept: Option<(u64, Instant)>,
-    /// Poses that the journal has, by epoch and keyframe.
+    /// Poses in the journal, by epoch and keyframe.
     poses: HashMap<(u32, u64), KeyframePose>,
 }
 
 impl KeyframeFeed {
-    /// Listens from now on.
+    /// Subscribes from now on.
     pub fn open(hub: &Hub) -> Result<Self, OpenError> {
         Ok(Self {
             depths: hub.subscriber(&KEYFRAME)?,
@@ -43,13 +43,13 @@ impl KeyframeFeed {
         })
     }
 
-    /// Takes in what came and gives the journal what is due; at the end everything is.
+    /// Takes in what has arrived and gives the journal what is due; at the end everything is.
     pub fn collect(&mut self, journal: &mut Journal, is_end: bool) -> Result<(), ReceiveError> {
         while let Some(depth) = self.depths.receive()? {
             let of = |header: &KeyframeHeader| (header.epoch, header.keyframe_id);
             let before = self.depth.as_ref().map(|(before, _)| of(before));
             if before.is_some_and(|before| before != of(depth.header())) {
-                // The last of a keyframe, while its image is still here.
+                // The last depth of a keyframe, while its image is still held.
                 self.keep(journal);
                 self.kept = None;
             }
@@ -65,7 +65,7 @@ impl KeyframeFeed {
         self.collect_graph(journal)
     }
 
-    /// Gives the journal the newest state of the keyframe, where it has an older one.
+    /// Gives the journal the newest state of the keyframe, where the journal's is older.
     fn keep(&mut self, journal: &mut Journal) {
         let (Some((header, points)), Some((image_header, pixels))) = (&self.depth, &self.image)
         else {
@@ -108,7 +108,7 @@ impl KeyframeFeed {
     }
 }
 
-/// Copies a message into the memory of the one before.
+/// Copies a message into the memory of the previous one.
 fn put<H: Copy, T: Copy>(held: &mut Option<(H, Vec<T>)>, header: &H, payload: &[T]) {
     let mut memory = held.take().map_or_else(Vec::new, |(_, memory)| memory);
     memory.clear();

@@ -1,4 +1,4 @@
-//! Where journals are, and which of them belong to runs that were killed.
+//! Where journals are, and which belong to runs that were killed.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -11,13 +11,13 @@ use crate::service::atomic_file::write_privately;
 use crate::service::results::output_folder::{PARENT, utc_stamp};
 use crate::wire::place::Place;
 
-/// Name of a journal, before the second (UTC) of its beginning and the process id.
+/// Prefix of a journal's name, before the second (UTC) of its start and the process id.
 const PREFIX: &str = ".semidense-journal-";
 /// Name of the log in it.
 pub const LOG: &str = "log";
-/// End of the name of a pointer to a journal, behind instance and process id.
+/// Suffix of the name of a pointer to a journal, after instance and process id.
 const POINTER_SUFFIX: &str = ".journal";
-/// Keyframe files begin so.
+/// Prefix of keyframe files.
 const KEYFRAME_PREFIX: &str = "keyframe-";
 
 /// Name of the file of a keyframe.
@@ -35,7 +35,7 @@ pub(super) fn begin_folder(output: &Path) -> io::Result<PathBuf> {
     Ok(folder)
 }
 
-/// Holds a log as the one who writes it or makes results of it; `None` where another process does.
+/// Holds a log, to write it or to make results from it; `None` where another process holds it.
 pub fn hold(log: &Path) -> io::Result<Option<File>> {
     let file = File::open(log)?;
     match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
@@ -45,7 +45,7 @@ pub fn hold(log: &Path) -> io::Result<Option<File>> {
     }
 }
 
-/// Removes a journal: its own files, and the folder where nothing else is in it.
+/// Removes a journal: its own files, then the folder, which must hold nothing else.
 pub fn remove_folder(folder: &Path) -> io::Result<()> {
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
@@ -54,17 +54,17 @@ pub fn remove_folder(folder: &Path) -> io::Result<()> {
             fs::remove_file(entry.path())?;
         }
     }
-    // Last: a journal without it is none.
+    // Last: a folder without it is not a journal.
     fs::remove_file(folder.join(LOG))?;
     fs::remove_dir(folder)
 }
 
-/// A file in the runtime folder that names the journal of a run: it is found from any folder.
+/// A file in the runtime folder that names the journal of a run, so that it is found from any folder.
 #[derive(Debug)]
 pub(super) struct Pointer(PathBuf);
 
 impl Pointer {
-    /// Sets it for the journal `folder`.
+    /// Writes it for the journal `folder`.
     pub fn set(place: &Place, folder: &Path) -> io::Result<Self> {
         use std::os::unix::ffi::OsStrExt;
         place.create().map_err(io::Error::other)?;
@@ -80,24 +80,24 @@ impl Pointer {
     }
 }
 
-/// A journal that nobody writes any more.
+/// A journal that no process writes any more.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Unfinished {
-    /// The second of its beginning, as it stands in its name: the order of journals.
+    /// The second of its start and the process id, as in its name: the order of journals.
     pub stamp: String,
     /// Its folder.
     pub folder: PathBuf,
 }
 
 impl Unfinished {
-    /// The output folder that it lies in.
+    /// The output folder that contains it.
     pub fn output(&self) -> &Path {
         self.folder.parent().unwrap_or(Path::new("."))
     }
 }
 
-/// Journals of killed runs, oldest first: in `output`, and in all folders that the instance at `place` has
-/// written into or that lie in [`PARENT`].
+/// Journals of killed runs, oldest first: in `output`, in all folders that the instance at `place` has written into,
+/// and in those below [`PARENT`].
 pub fn unfinished(place: Option<&Place>, output: &Path) -> Vec<Unfinished> {
     let mut folders = journals_in(output);
     for entry in fs::read_dir(PARENT).into_iter().flatten().flatten() {
@@ -120,7 +120,7 @@ fn journals_in(output: &Path) -> Vec<PathBuf> {
     names.map(|entry| entry.path()).collect()
 }
 
-/// The journals that pointers of the instance name; a pointer to one that is gone goes.
+/// The journals that pointers of the instance name; removes pointers to journals that are gone.
 fn pointed_at(place: &Place) -> Vec<PathBuf> {
     use std::os::unix::ffi::OsStringExt;
     let mut found = Vec::new();
@@ -134,14 +134,14 @@ fn pointed_at(place: &Place) -> Vec<PathBuf> {
         let folder = PathBuf::from(std::ffi::OsString::from_vec(bytes));
         match folder.join(LOG).exists() {
             true => found.push(folder),
-            // What cannot be removed is removed by the next.
+            // What cannot be removed is left to the next search.
             false => drop(fs::remove_file(entry.path())),
         }
     }
     found
 }
 
-/// The journal in `folder`, where nobody holds it.
+/// The journal in `folder`, if no process holds it.
 fn abandoned(folder: PathBuf) -> Option<Unfinished> {
     let folder = folder.canonicalize().ok()?;
     hold(&folder.join(LOG)).ok()??;
@@ -154,7 +154,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_journal_that_nobody_holds_is_found_in_its_folder_and_by_its_pointer() {
+    fn an_unheld_journal_is_found_in_its_folder_and_by_its_pointer() {
         let root = tempfile::tempdir_in("/tmp").unwrap();
         let place = Place::new("rig", root.path().to_str().unwrap()).unwrap();
         let output = tempfile::tempdir().unwrap();

@@ -1,8 +1,8 @@
-//! The log of a run: an append-only file of checked records, little-endian; messages are in it as they came.
+//! The log of a run: an append-only file of checked records, little-endian; messages are stored as received.
 //!
-//! Layout: magic, then records: bytes of kind and payload together (u32), their CRC-32 (u32), kind (u8),
-//! payload. A process that dies tears the last record at most: reading ends at the first record that is not
-//! whole, and what came before counts.
+//! Layout: magic, then records: byte count of kind and payload together (u32), their CRC-32 (u32), kind (u8), payload.
+//! A dying process tears at most the last record: reading ends at the first incomplete record, and those before it
+//! count.
 
 use std::ffi::OsString;
 use std::io::Read;
@@ -24,33 +24,33 @@ use crate::wire::message::{AdjustmentMessage, PoseMessage};
 const MAGIC: [u8; 16] = *b"semidense log 8\n";
 /// Bytes before kind and payload.
 const PREFIX_BYTES: usize = 8;
-/// Largest record: the configuration is a tenth of it.
+/// Largest record, bytes: the configuration is a tenth of it.
 const MAX_RECORD_BYTES: usize = 1 << 20;
-/// Largest log that is read: three weeks of poses at 30 Hz would be larger.
+/// Largest log that is read, bytes: three weeks of poses at 30 Hz would be larger.
 pub(super) const MAX_LOG_BYTES: u64 = 32 << 30;
 
-/// How a run was started: what it takes to open its source again.
+/// How a run was started: everything needed to open its source again.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunStart {
     /// How it is driven.
     pub mode: RunMode,
-    /// Where the frames come from; a path in it may have any bytes.
+    /// Source of the frames; a path in it may have any bytes.
     #[serde(with = "any_bytes")]
     pub source: OsString,
     /// The camera's rig file.
     #[serde(with = "any_bytes::optional")]
     pub rig: Option<OsString>,
-    /// The folder that relative paths are relative to.
+    /// The folder that relative paths refer to.
     #[serde(with = "any_bytes")]
     pub folder: OsString,
     /// The whole configuration, as TOML.
     pub config: String,
-    /// Whether poses were given and not estimated.
+    /// Whether poses were given rather than estimated.
     pub poses_given: bool,
     /// Whether keyframes took their first depth from the source's depth camera.
     #[serde(default)]
     pub is_depth_from_sensor: bool,
-    /// When, nanoseconds since 1970: two runs may begin in one second.
+    /// Start time, nanoseconds since 1970: two runs may begin in one second.
     pub began_nanos: u64,
 }
 
@@ -64,30 +64,30 @@ impl RunStart {
 /// A step of the mapper.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Step {
-    /// Time that it took.
+    /// Time it took.
     pub step_nanos: u64,
-    /// The part of it in which a keyframe was made and published; 0 where none was.
+    /// The part of it spent on making and publishing a keyframe; 0 where none was made.
     pub change_nanos: u64,
-    /// What the frame came to in a start, as its code in `mapper/step`.
+    /// The outcome of the frame in a start, as its code in `mapper/step`.
     pub start_frame: u32,
 }
 
 /// One entry of the log.
 #[derive(Debug, Clone)]
 pub enum Record {
-    /// The first one.
+    /// The first record.
     Start(Box<RunStart>),
-    /// A pose as it was received.
+    /// A pose as received.
     Pose(Box<PoseMessage>),
     /// A step of the mapper.
     Step(Step),
-    /// A joint estimate of keyframes is over.
+    /// A finished joint estimate of keyframes.
     Adjustment(AdjustmentMessage),
-    /// What was counted until now.
+    /// The counters so far.
     Counters(Box<RunCounters>),
     /// A keyframe without image and points.
     Keyframe(Box<Keyframe>),
-    /// A keyframe's pose has changed; how uncertain it is stays what it was.
+    /// The new pose of a keyframe; its uncertainty is unchanged.
     KeyframePose(u32, KeyframePose),
 }
 
@@ -115,7 +115,7 @@ impl Record {
         match self {
             Self::Start(start) => {
                 log.push(Self::START);
-                // Strings and plain values: nothing that JSON cannot say.
+                // Strings and plain values, which JSON can always hold.
                 log.extend(serde_json::to_vec(start).unwrap_or_default());
             }
             Self::Pose(pose) => {
@@ -147,7 +147,7 @@ impl Record {
         }
     }
 
-    /// The record of a kind and a payload; `None` where they do not fit.
+    /// The record of a kind and a payload; `None` where they do not match.
     fn from_body(body: &[u8]) -> Option<Self> {
         let (&kind, payload) = body.split_first()?;
         let mut bytes = payload;
@@ -182,18 +182,18 @@ pub fn log_header() -> Vec<u8> {
     MAGIC.to_vec()
 }
 
-/// What a log holds.
+/// How a log ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LogEnd {
-    /// It ends with a whole record.
+    /// With a whole record.
     Whole,
-    /// What follows the last whole record cannot be read: the process died while it wrote.
+    /// Bytes after the last whole record cannot be read: the process died while writing.
     Torn,
-    /// It is something else, or of another version.
+    /// The bytes are not a log of this version.
     Unknown,
 }
 
-/// Reads a log to its end, or to the first record that is not whole.
+/// Reads a log to its end, or to the first incomplete record.
 pub fn read_log(log: impl Read, take: &mut dyn FnMut(Record)) -> LogEnd {
     let mut log = log.take(MAX_LOG_BYTES);
     let mut magic = [0; MAGIC.len()];
@@ -313,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn every_record_comes_back_and_a_torn_end_costs_one() {
+    fn every_record_is_read_back_and_a_torn_end_costs_one() {
         let mut log = log_header();
         let mut ends = vec![log.len()];
         for record in records() {

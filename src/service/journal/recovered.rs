@@ -1,4 +1,4 @@
-//! A run as its journal has it.
+//! A run reconstructed from its journal.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -22,24 +22,24 @@ pub enum JournalError {
     Read {
         /// The log.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
-    /// The log is something else.
+    /// The file is not a log of this version.
     #[error("{0} is not a journal of this version of semidense")]
     Unknown(PathBuf),
 }
 
-/// Everything that a journal holds but the depth of its keyframes.
+/// The contents of a journal without the depth of its keyframes.
 #[derive(Debug)]
 pub struct Recovered {
     /// How the run was started.
     pub start: RunStart,
     /// Its poses and times.
     pub recording: Recording,
-    /// When the log was written last: about the end of the run.
+    /// Last write to the log: about the end of the run.
     pub ended: SystemTime,
-    /// What was counted last; frames at least as many as poses.
+    /// The last counters; at least as many frames as poses.
     pub counters: RunCounters,
     /// Keyframes by epoch and id, without image and points.
     keyframes: BTreeMap<(u32, u64), Keyframe>,
@@ -56,7 +56,7 @@ impl Recovered {
         Ok(Self { ended: written.unwrap_or(found.ended), ..found })
     }
 
-    /// What a log holds; `None` where it does not begin with the start of a run.
+    /// Reads a log; `None` where it does not begin with the start of a run.
     pub fn from_log(log: impl Read) -> Option<Self> {
         let mut found: Option<Self> = None;
         read_log(log, &mut |record| match (&mut found, record) {
@@ -79,9 +79,9 @@ impl Recovered {
 
     fn take(&mut self, record: Record) {
         match record {
-            // There is one, at the beginning.
+            // A log has one, as its first record.
             Record::Start(_) => {}
-            // The reader of the log cannot know what a pose may hold; what cannot be is left out.
+            // Reading the log does not check the contents of a pose; invalid ones are left out.
             Record::Pose(pose) => drop(self.recording.take_pose(&pose)),
             Record::Step(step) => {
                 self.recording.take_step(step.step_nanos, step.change_nanos, step.start_frame)
@@ -105,7 +105,7 @@ impl Recovered {
         self.counters.frames_in = frames_in;
     }
 
-    /// The map, with at most `max_bytes` of depth from the files in `folder`, the newest first.
+    /// The map, with at most `max_bytes` of depth from the files in `folder`, newest first.
     pub fn map(&self, folder: &Path, max_bytes: u64) -> Map {
         let mut keyframes: Vec<Keyframe> = self.keyframes.values().cloned().collect();
         let mut bytes = 0;
@@ -125,19 +125,19 @@ impl Recovered {
     }
 }
 
-/// The map of the journal in `folder`; empty where it cannot be read.
+/// The map in the journal in `folder`; empty where it cannot be read.
 pub(super) fn read_map_of(folder: &Path, max_bytes: u64) -> Map {
     Recovered::read(folder).map_or_else(|_| Map::default(), |found| found.map(folder, max_bytes))
 }
 
-/// Gives a keyframe image and depth of another state of it: its unit is its own in each.
+/// Gives a keyframe image and depth of another state of it: each is in the keyframe's own unit.
 fn take_depth(keyframe: &mut Keyframe, from: Keyframe) {
     keyframe.image = from.image;
     keyframe.points = from.points;
 }
 
-/// Completes the map of a mapper that has died on the way with what the journal kept: depth that the mapper no
-/// longer has, and keyframes that it never heard of.
+/// Completes the map of a mapper that died during the run from the journal: depth that the mapper no longer has, and
+/// keyframes it never received.
 pub fn complete(map: &mut Map, journal: Map) {
     for kept in journal.keyframes {
         let is_same = |keyframe: &Keyframe| {

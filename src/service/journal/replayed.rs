@@ -1,4 +1,4 @@
-//! The journal of a replay: the same records, taken from the record that grows in the same process.
+//! The journal of a replay: the same records, taken from the run record that grows in the same process.
 
 use std::collections::HashMap;
 use std::io;
@@ -14,7 +14,7 @@ use crate::slam::keyframe::{Keyframe, KeyframePose};
 use crate::wire::conversion::{PoseTiming, code_from_start_frame, pose_message};
 use crate::wire::place::Place;
 
-/// Time between two states of the same keyframe in the journal.
+/// Time between two writes of the same keyframe to the journal.
 const PERIOD: Duration = Duration::from_secs(2);
 
 /// Follows a replay.
@@ -22,18 +22,18 @@ const PERIOD: Duration = Duration::from_secs(2);
 pub struct ReplayJournal {
     journal: Journal,
     begin: Instant,
-    /// Poses, steps and joint estimates that the journal has.
+    /// Poses, steps and joint estimates in the journal.
     poses: usize,
     steps: usize,
     adjustments: usize,
-    /// Revisions that the journal has, by epoch and keyframe.
+    /// Revisions in the journal, by epoch and keyframe.
     revisions: HashMap<(u32, u64), u64>,
     active: Option<(u32, u64)>,
     looked: Instant,
 }
 
 impl ReplayJournal {
-    /// Begins it.
+    /// Begins the journal.
     pub fn begin(options: &JournalOptions, place: &Place) -> io::Result<Self> {
         Ok(Self {
             journal: Journal::begin(options, place)?,
@@ -52,7 +52,7 @@ impl ReplayJournal {
         self.journal
     }
 
-    /// Takes in what a frame has brought.
+    /// Takes in what a frame has added.
     pub fn observe(&mut self, progress: &ReplayProgress<'_>) {
         self.take_poses(progress.record, code_from_start_frame(progress.start_frame));
         let key = |keyframe: &Keyframe| (keyframe.epoch, keyframe.keyframe_id);
@@ -60,7 +60,7 @@ impl ReplayJournal {
         let has_changed = active != self.active;
         if has_changed || self.looked.elapsed() >= PERIOD {
             self.looked = Instant::now();
-            // One that the disk was too slow for is tried again in the next round.
+            // A keyframe for which the disk was too slow is retried in the next round.
             self.active = active;
             self.take_keyframes(&progress.map.keyframes);
         }
@@ -89,8 +89,8 @@ impl ReplayJournal {
         self.adjustments = record.adjustments.len();
     }
 
-    /// Gives the journal every keyframe of which it has an older state. Of older keyframes, of which a correction
-    /// moves many, the places alone: their depth hardly changes any more, and takes 2 MB each.
+    /// Gives the journal every keyframe whose state there is older. Of older keyframes, many of which a correction
+    /// moves, only the poses: their depth hardly changes any more, and takes 2 MB each.
     fn take_keyframes(&mut self, keyframes: &[Keyframe]) {
         const WITH_DEPTH: usize = 3;
         let older = keyframes.len().saturating_sub(WITH_DEPTH);

@@ -1,4 +1,4 @@
-//! The thread that brings a journal to the disk.
+//! The thread that writes a journal to disk.
 
 use std::collections::VecDeque;
 use std::fs::{self, File};
@@ -17,24 +17,24 @@ use crate::service::map_file::write_map_into;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 
-/// Most bytes of log that wait for room on a full disk; ten hours of poses.
+/// Most bytes of log that wait for room on a full disk: ten hours of poses.
 const MAX_WAITING_BYTES: usize = 512 << 20;
 /// Name of the log until it is held and begun.
 const UNBEGUN_LOG: &str = "log.new";
 
-/// What the thread is handed.
+/// Work for the thread.
 #[derive(Debug)]
 pub(super) enum Entry {
-    /// Whole records of the log, and how many poses there are with them from its beginning, without a hole.
+    /// Whole records of the log, and the number of poses from its beginning to their end, without a hole.
     Log(Vec<u8>, u64),
     /// A keyframe's newest state.
     Keyframe(Box<Keyframe>),
-    /// Answered when everything before is on the disk.
+    /// Answered once everything before it is on disk.
     Mark(Sender<()>),
 }
 
-/// Whether the disk refuses something, for a warning on each change: on a full disk a write succeeds now and
-/// then, which is no change.
+/// Whether the disk refuses writes, to warn on each change: on a full disk a write succeeds now and then, which is not
+/// a change.
 #[derive(Debug, Default)]
 struct Refusals {
     is_said: bool,
@@ -42,10 +42,10 @@ struct Refusals {
 }
 
 impl Refusals {
-    /// So many successes in a row end it: about a minute of them.
+    /// This many successes in a row end it: about a minute.
     const CALM: u32 = 60;
 
-    /// Counts an outcome; whether it is a refusal that has not been said.
+    /// Counts an outcome; returns whether it is a refusal not yet reported.
     fn is_news(&mut self, is_refused: bool) -> bool {
         self.successes = if is_refused { 0 } else { self.successes.saturating_add(1) };
         if self.successes >= Self::CALM {
@@ -55,20 +55,20 @@ impl Refusals {
     }
 }
 
-/// Writes what it is handed.
+/// Writes the entries of a journal.
 #[derive(Debug)]
 pub(super) struct Writer {
     folder: PathBuf,
     log: File,
-    /// Bytes of the log that end with a whole record.
+    /// Bytes of the log up to the end of its last whole record.
     good_bytes: u64,
-    /// Whole records that the disk has refused so far.
+    /// Whole records that the disk has not accepted yet.
     waiting: Vec<u8>,
-    /// Poses from the beginning to the end of what waits, or to the first hole.
+    /// Poses from the beginning to the end of the waiting records, or to the first hole.
     poses: u64,
-    /// Whether records were left out: what comes later has no place among the poses that are counted.
+    /// Whether records were left out: later poses are no longer counted.
     has_hole: bool,
-    /// Of those poses, how many are on the disk and can be read again.
+    /// How many of those poses are on disk and can be read back.
     on_disk: Arc<AtomicU64>,
     /// Files with depth, oldest first, and their bytes.
     files: VecDeque<(PathBuf, u64)>,
@@ -78,8 +78,8 @@ pub(super) struct Writer {
 }
 
 impl Writer {
-    /// Begins a log in `folder` with `first`, which is on the disk when this returns. The log is held before it
-    /// has its name: one that nobody holds is that of a run that was killed.
+    /// Begins a log in `folder` with `first`, which is on disk on return. The log is held before it gets its name: one
+    /// that no process holds belongs to a killed run.
     pub fn create(folder: &Path, first: &[u8], max_depth_bytes: u64) -> io::Result<Self> {
         let unbegun = folder.join(UNBEGUN_LOG);
         let log = File::create_new(&unbegun)?;
@@ -106,17 +106,17 @@ impl Writer {
         })
     }
 
-    /// What keeps the log held, also when the thread is gone.
+    /// Keeps the log held, even after the thread has ended.
     pub fn hold(&self) -> io::Result<File> {
         self.log.try_clone()
     }
 
-    /// How many poses, from the first without a hole, are on the disk.
+    /// How many poses, from the first on and without a hole, are on disk.
     pub fn poses_on_disk(&self) -> Arc<AtomicU64> {
         Arc::clone(&self.on_disk)
     }
 
-    /// Writes until nobody hands anything over any more.
+    /// Writes until every sender is gone.
     pub fn write_all(mut self, entries: &Receiver<Entry>) {
         for entry in entries {
             if let Some(warning) = self.write(entry) {
@@ -125,7 +125,7 @@ impl Writer {
         }
     }
 
-    /// Writes what it is handed; gives what there is to say.
+    /// Writes one entry; returns a warning to be logged, if any.
     fn write(&mut self, entry: Entry) -> Option<String> {
         match entry {
             Entry::Log(records, poses) => {
@@ -147,15 +147,15 @@ impl Writer {
                 })
             }
             Entry::Mark(done) => {
-                // Who has asked may have given up.
+                // The requester may have given up.
                 let _ = done.try_send(());
                 None
             }
         }
     }
 
-    /// Appends records. On a full disk depth makes room for them, the oldest first: a run without poses is
-    /// lost, one without some depth is not. What is still refused is tried with the next.
+    /// Appends records. On a full disk depth makes room for them, the oldest first: a run without poses is lost, one
+    /// without some depth is not. Records still refused are retried with the next.
     fn append(&mut self, records: &[u8], poses: u64) -> io::Result<()> {
         self.has_hole |= self.waiting.len() >= MAX_WAITING_BYTES;
         if self.waiting.len() < MAX_WAITING_BYTES {
@@ -174,7 +174,7 @@ impl Writer {
         written
     }
 
-    /// Appends what waits, behind the last whole record: what a refused attempt has left there is overwritten.
+    /// Appends the waiting records after the last whole one, overwriting what a refused attempt left there.
     fn append_waiting(&mut self) -> io::Result<()> {
         let written = self.log.write_all_at(&self.waiting, self.good_bytes);
         match written.and_then(|()| self.log.sync_data()) {
@@ -187,14 +187,14 @@ impl Writer {
                 Ok(())
             }
             Err(error) => {
-                // It only takes room from others.
+                // A partial write only takes room from others.
                 drop(self.log.set_len(self.good_bytes));
                 Err(error)
             }
         }
     }
 
-    /// Replaces the file of a keyframe, and removes the oldest where there is too much.
+    /// Replaces the file of a keyframe, and removes the oldest files beyond the limit.
     fn write_keyframe(&mut self, keyframe: Keyframe) -> io::Result<()> {
         let path = self.folder.join(keyframe_file(keyframe.epoch, keyframe.keyframe_id));
         let temporary = path.with_extension("tmp");
@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn a_log_is_held_as_long_as_it_is_there() {
+    fn a_log_is_held_as_long_as_it_exists() {
         let folder = tempfile::tempdir().unwrap();
         let seen = folder.path().join(LOG);
         let writer = writer(folder.path());
@@ -273,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_disk_is_said_once_also_where_some_of_it_is_written() {
+    fn a_full_disk_is_reported_once_even_if_some_writes_succeed() {
         let folder = tempfile::tempdir().unwrap();
         let mut writer = writer(folder.path());
         let log = std::mem::replace(
@@ -286,7 +286,7 @@ mod tests {
             .collect();
         assert_eq!(said.len(), 1, "{said:?}");
         assert!(said[0].contains("the journal is behind"), "{said:?}");
-        // It is emptied, and what has waited is written; after a while a full disk is news again.
+        // Once the disk has room, the waiting records are written; after a while a full disk is reported again.
         writer.log = log;
         for n in 0..Refusals::CALM {
             assert_eq!(writer.write(Entry::Log(step(n.into()), 0)), None);
@@ -300,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn only_poses_that_the_disk_has_taken_are_counted() {
+    fn only_poses_on_disk_are_counted() {
         let folder = tempfile::tempdir().unwrap();
         let mut writer = writer(folder.path());
         let on_disk = writer.poses_on_disk();
@@ -314,7 +314,7 @@ mod tests {
         writer.log = log;
         writer.write(Entry::Log(step(2), 6));
         assert_eq!(counted(), 6);
-        // More than may wait: what comes is left out, and what follows has no place.
+        // Beyond the limit records are left out, and poses after them are not counted.
         writer.waiting = vec![0; MAX_WAITING_BYTES];
         writer.log = File::options().write(true).open("/dev/full").unwrap();
         writer.write(Entry::Log(step(3), 9));
@@ -325,11 +325,11 @@ mod tests {
     }
 
     #[test]
-    fn what_a_refused_attempt_has_left_is_overwritten() {
+    fn leftovers_of_a_refused_attempt_are_overwritten() {
         let folder = tempfile::tempdir().unwrap();
         let mut writer = writer(folder.path());
         assert_eq!(writer.write(Entry::Log(step(1), 0)), None);
-        // Torn, and the disk refused to cut it off.
+        // Torn, and the disk refused to truncate it.
         let path = folder.path().join(LOG);
         let end = fs::metadata(&path).unwrap().len();
         io::Seek::seek(&mut writer.log, io::SeekFrom::Start(end)).unwrap();

@@ -1,4 +1,4 @@
-//! A map survives its file, and a broken file is an error.
+//! A map survives its file, and a corrupt file is an error.
 
 use super::*;
 use crate::slam::geometry::se3::SE3;
@@ -75,7 +75,7 @@ fn points_of_the_joint_estimation_lie_in_their_keyframes() {
 }
 
 #[test]
-fn every_cut_and_every_wrong_byte_is_survived() {
+fn cut_or_corrupt_bytes_never_panic() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("map.bin");
     write_map(&path, &map(), &mut || ()).unwrap();

@@ -1,15 +1,15 @@
 //! The file of one keyframe in a map folder: its image and its depth, little-endian.
 //!
-//! Layout: magic, version, detail (u32), keyframe (u64), width, height, number of points, step of the
-//! image's grey levels, whether brightnesses follow (u32), bytes of the image (u64), smallest and largest logarithm of
-//! the inverse depths and of the standard deviations (4 × f32), bytes of the places and of the description (u32); the
-//! description (`description`), with a checksum of its own, so that damage there costs nothing else; where points are
-//! (`pixels`); the image; the numbers of the points, in row-major order; the CRC-32 of all before it but the description
-//! (u32). Version 1 has no description and neither of the two numbers, and one bit a pixel for the places.
+//! Layout: magic, version, detail (u32), keyframe (u64), width, height, number of points, step of the image's grey
+//! levels, whether brightnesses follow (u32), bytes of the image (u64), smallest and largest logarithm of the inverse
+//! depths and of the standard deviations (4 × f32), bytes of the positions and of the description (u32); the
+//! description (`description`), with a separate checksum, so that damage there costs nothing else; the points'
+//! positions (`pixels`); the image; the points' numbers, row-major; the CRC-32 of all this except the description
+//! (u32). Version 1 has no description, neither of the last two byte counts, and one bit per pixel for the positions.
 //!
-//! In full detail the image is as it is (step 0) and a point has its inverse depth and variance (f32), and its
-//! brightness (f32) where that is not the image's: the same bits come back. In small detail the image is a PNG of grey
-//! levels that are rounded to a step, and a point has logarithms of inverse depth (u16) and standard deviation (u8).
+//! In full detail the image is unchanged (step 0) and a point has its inverse depth and variance (f32), and its
+//! brightness (f32) where that differs from the image's: the same bits are read back. In small detail the image is a
+//! PNG of grey levels rounded to a step; a point has logarithms of inverse depth (u16) and standard deviation (u8).
 
 mod description;
 mod pixels;
@@ -30,21 +30,21 @@ use crate::wire::conversion::{MessageError, check_points};
 const MAGIC: [u8; 16] = *b"semidense depth\n";
 /// Version of the layout.
 const VERSION: u32 = 2;
-/// The one before, which can still be read.
+/// The previous version, which can still be read.
 const VERSION_BEFORE: u32 = 1;
-/// Bytes before the description, and before the places in the version before.
+/// Bytes before the description, and before the positions in the previous version.
 const HEAD_BYTES: usize = HEAD_BYTES_BEFORE + size_of::<PartBytes>();
 const HEAD_BYTES_BEFORE: usize = size_of::<Head>();
 /// Bytes of the checksum.
 const CHECKSUM_BYTES: usize = 4;
 
-/// In small detail an image takes at most 1 bit in 4 of what it has (2 a pixel) where a step allows it…
+/// In small detail an image takes at most 1 bit in 4 of its size (2 per pixel) where a step allows it…
 const SMALL_IMAGE_SHARE: usize = 4;
-/// …and so many pixels have one point: with where they are, less than half a byte a pixel in all.
+/// …and this many pixels share one point: with its position, less than half a byte per pixel in all.
 const SMALL_PIXELS_PER_POINT: usize = 28;
-/// Steps of grey levels that are tried, the finest first; the last one is taken where none is small enough.
+/// Steps of grey levels to try, finest first; the last one is used where none is small enough.
 const SMALL_STEPS: [u8; 5] = [1, 2, 4, 8, 16];
-/// Values of the two logarithms.
+/// Steps of the two logarithms.
 const INVERSE_DEPTH_STEPS: f32 = u16::MAX as f32;
 const STD_DEV_STEPS: f32 = u8::MAX as f32;
 
@@ -52,7 +52,7 @@ const STD_DEV_STEPS: f32 = u8::MAX as f32;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MapDetail {
-    /// All of it: about 1.1 MB at 640×480, and the same bits come back.
+    /// All of it, bit for bit: about 1.1 MB at 640×480.
     #[default]
     Full,
     /// At most 0.13 MB at 640×480: grey levels are rounded, and one point in nine is kept, the best of each group.
@@ -62,30 +62,30 @@ pub enum MapDetail {
 /// Why the file of a keyframe cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum DepthFileError {
-    /// It is something else.
+    /// It is not the file of a keyframe.
     #[error("it is not a keyframe of a map")]
     Magic,
-    /// Another version has written it.
+    /// Another version wrote it.
     #[error("it is of version {0}, and this program reads up to version {VERSION}")]
     Version(u32),
-    /// It is cut short, or has more than it should.
+    /// It is cut short or too long.
     #[error("it has {found} bytes instead of {expected}")]
     Length {
-        /// Bytes that there are.
+        /// Bytes found.
         found: usize,
-        /// Bytes that its head asks for.
+        /// Bytes according to its head.
         expected: usize,
     },
     /// A bit is wrong.
     #[error("its checksum is wrong: it is damaged")]
     Checksum,
-    /// It is the file of another keyframe, or of another image size.
+    /// It belongs to another keyframe or to another image size.
     #[error("it belongs to another keyframe")]
     Foreign,
-    /// A number in its head is not possible.
+    /// A number in its head is invalid.
     #[error("{what} = {value} is not possible")]
     Head {
-        /// Which.
+        /// Which number.
         what: &'static str,
         /// Its value.
         value: u64,
@@ -93,12 +93,12 @@ pub enum DepthFileError {
     /// Its image cannot be decoded.
     #[error("image: {0}")]
     Image(#[from] DecodeError),
-    /// Its points are broken.
+    /// Its points are invalid.
     #[error(transparent)]
     Points(#[from] MessageError),
 }
 
-/// Most bytes of the file of a keyframe with so many pixels.
+/// Most bytes of the file of a keyframe with this many pixels.
 pub fn most_bytes(num_pixels: usize) -> usize {
     // A PNG of noise is a little larger than its samples.
     let image = 2 * num_pixels + 4096;
@@ -106,12 +106,13 @@ pub fn most_bytes(num_pixels: usize) -> usize {
     HEAD_BYTES + description::MOST_BYTES + image + points + CHECKSUM_BYTES
 }
 
-/// Most points that small detail keeps of an image of so many pixels.
+/// Most points that small detail keeps of an image with this many pixels.
 fn most_small_points(num_pixels: usize) -> usize {
     num_pixels.div_ceil(SMALL_PIXELS_PER_POINT).min(MAX_KEYFRAME_POINTS)
 }
 
-/// The bytes of a keyframe that has image and depth, and the description where there is one. Points out of order, and outside the image, are left out.
+/// The bytes of a keyframe that has image and depth, and its description if any. Its points are sorted; those outside
+/// the image and all but one per pixel are left out.
 pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
     let mut points = in_order(keyframe);
@@ -173,7 +174,7 @@ pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
     bytes
 }
 
-/// Gives a file's bytes the checksum that they should have.
+/// Writes the correct checksum into a file's bytes.
 pub fn seal(bytes: &mut [u8]) {
     let checksum = expected_checksum(bytes);
     if let Some(end) = bytes.last_chunk_mut::<CHECKSUM_BYTES>() {
@@ -181,7 +182,7 @@ pub fn seal(bytes: &mut [u8]) {
     }
 }
 
-/// The checksum of all but the description.
+/// The checksum of everything except the description.
 fn expected_checksum(bytes: &[u8]) -> u32 {
     let mut rest = bytes;
     let parts = take_head(&mut rest).and_then(|(_, parts)| parts);
@@ -194,13 +195,13 @@ fn expected_checksum(bytes: &[u8]) -> u32 {
     hasher.finalize()
 }
 
-/// The checksum at the end of a file's bytes; 0 of one that has none.
+/// The checksum at the end of a file's bytes; 0 where they are too few.
 pub fn checksum_of(bytes: &[u8]) -> u32 {
     bytes.last_chunk::<CHECKSUM_BYTES>().map_or(0, |bytes| u32::from_le_bytes(*bytes))
 }
 
-/// Gives `keyframe` the image and the points of its file, and the description where that is whole. On an error it stays as
-/// it is.
+/// Gives `keyframe` the image and the points of its file, and the description where that is intact. On an error the
+/// keyframe is unchanged.
 pub fn decode_into(bytes: &[u8], keyframe: &mut Keyframe) -> Result<(), DepthFileError> {
     let mut rest = bytes;
     let (head, part_bytes) = take_head(&mut rest).ok_or(DepthFileError::Length {
@@ -245,7 +246,7 @@ pub fn decode_into(bytes: &[u8], keyframe: &mut Keyframe) -> Result<(), DepthFil
     Ok(())
 }
 
-/// What stands before the parts.
+/// The head of a file, before its parts.
 #[derive(FromBytes, IntoBytes, Immutable)]
 #[repr(C, packed)]
 struct Head {
@@ -263,7 +264,7 @@ struct Head {
     deviations: Logarithms,
 }
 
-/// What follows it since the second version.
+/// The rest of the head since the second version.
 #[derive(Clone, Copy, FromBytes, IntoBytes, Immutable)]
 #[repr(C)]
 struct PartBytes {
@@ -287,7 +288,7 @@ struct Sizes {
 }
 
 impl Head {
-    /// Checks what can be checked before anything is believed; how large the parts are then.
+    /// Checks the head before any of it is trusted; returns the sizes of the parts.
     fn check(&self, parts: Option<PartBytes>, of: &Keyframe) -> Result<Sizes, DepthFileError> {
         if self.magic != MAGIC {
             return Err(DepthFileError::Magic);
@@ -336,7 +337,7 @@ impl Head {
         })
     }
 
-    /// A point from its numbers; `at` has the pixel and its brightness.
+    /// Decodes a point; `at` has the pixel and its brightness.
     fn point(&self, mut numbers: &[u8], at: DepthPoint) -> DepthPoint {
         if self.detail == 0 {
             let mut next = || take::<f32>(&mut numbers);
@@ -358,7 +359,7 @@ impl Head {
     }
 }
 
-/// The range of the logarithms of some numbers, which are coded in even steps of it.
+/// The range of the logarithms of some numbers, which are coded in equal steps of it.
 #[derive(Clone, Copy, FromBytes, IntoBytes, Immutable)]
 #[repr(C)]
 struct Logarithms {
@@ -387,7 +388,7 @@ impl Logarithms {
     }
 }
 
-/// The points that lie in the image, in row-major order, one a pixel.
+/// The points inside the image, in row-major order, one per pixel.
 fn in_order(keyframe: &Keyframe) -> Vec<DepthPoint> {
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
     let inside = |p: &&DepthPoint| usize::from(p.u) < width && usize::from(p.v) < height;
@@ -400,7 +401,7 @@ fn in_order(keyframe: &Keyframe) -> Vec<DepthPoint> {
     points
 }
 
-/// At most so many points: of each group that follow one another the one that is known best.
+/// At most `most` points: of each group of consecutive points the one with the lowest relative variance.
 fn best_of_groups(points: &[DepthPoint], most: usize) -> Vec<DepthPoint> {
     let group = points.len().div_ceil(most.max(1)).max(1);
     let spread = |p: &DepthPoint| p.variance / (p.inverse_depth * p.inverse_depth);
@@ -416,12 +417,12 @@ fn brightness(image: &[u8], width: usize, at: &DepthPoint) -> f32 {
     f32::from(image.get(pixel).copied().unwrap_or_default())
 }
 
-/// The image as a PNG of steps of grey levels, of the finest that is small enough, and that step.
+/// The image as a PNG in the finest step of grey levels that is small enough, and that step.
 fn small_image(image: &[u8], width: usize, height: usize) -> (u8, Vec<u8>) {
     let mut smallest = (0, Vec::new());
     for step in SMALL_STEPS {
         let codes: Vec<u8> = image.iter().map(|grey| grey / step).collect();
-        // Into memory, of the right size: it does not fail.
+        // Into memory, of the right size: cannot fail.
         smallest = (step, encode_gray_small(width, height, &codes).unwrap_or_default());
         if smallest.1.len() <= image.len() / SMALL_IMAGE_SHARE {
             break;

@@ -1,9 +1,9 @@
-//! Keeps a map on disk while it is made: on a thread of its own, so that no frame waits for a file.
+//! Keeps a map on disk while it is made, on a separate thread, so that no frame waits for a file.
 //!
-//! With every keyframe that is made, and every correction, what is new goes to the disk: a keyframe when it is left, and
-//! of those that have changed since they were written one, the one that has waited longest; then the manifest, with the
-//! newest place of all. So a save costs two keyframes at most, however large the map is, and a process that is killed
-//! leaves a map that lacks the keyframe it was at. What has changed and was not written yet is at the end.
+//! Each new keyframe and each correction writes what is new to disk: a keyframe when it is left, and, of those that
+//! have changed since they were written, the one that has waited longest; then the manifest, with the newest pose of
+//! every keyframe. A save thus costs at most two keyframes, however large the map is, and a killed process leaves a map
+//! without its active keyframe. Changes that are not written yet are written at the end.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -19,7 +19,7 @@ use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::map::Map;
 use crate::slam::mapper::{Mapper, StepOutcome};
 
-/// Keyframes that wait to be written; a disk that is slower than that gets the others later.
+/// Keyframes that wait to be written; a slower disk gets the others later.
 const MOST_WAITING: usize = 8;
 
 /// Follows a mapper.
@@ -29,9 +29,9 @@ pub struct MapKeeper {
     numbering: Numbering,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
-    /// Revisions of keyframes that were handed over, by their id.
+    /// Revisions of the keyframes that were handed over, by id.
     handed: BTreeMap<u64, u64>,
-    /// Whether a save waits for the one before.
+    /// Whether a save waits for the previous one.
     waits: bool,
 }
 
@@ -39,28 +39,28 @@ pub struct MapKeeper {
 struct Shared {
     waiting: Mutex<Waiting>,
     wake: Condvar,
-    /// The thread has nothing to do.
+    /// Signalled when the thread has nothing to do.
     idle: Condvar,
     writer: Mutex<MapWriter>,
 }
 
-/// What the thread is to write.
+/// Work for the thread.
 #[derive(Debug, Default)]
 struct Waiting {
     keyframes: BTreeMap<u64, Keyframe>,
     head: Option<MapHead>,
     is_over: bool,
     is_busy: bool,
-    /// Whether something was not written.
+    /// Whether a write has failed.
     has_failed: bool,
-    /// Why the last save failed, until that is told.
+    /// Why the last save failed, until it is reported.
     failure: Option<String>,
 }
 
 impl MapKeeper {
-    /// Keeps the map of `camera` in a folder. `loaded` is the map that the folder holds already; its numbers of
-    /// keyframes may differ from those of the mapper. Where frames may wait (`waits`) a save waits for the one before,
-    /// so that a kill costs at most a keyframe where frames come faster than the disk writes.
+    /// Keeps the map of `camera` in a folder. `loaded` is the map that the folder already holds; its keyframe numbers
+    /// may differ from those of the mapper. Where frames may wait (`waits`) a save waits for the previous one, so that
+    /// a kill costs at most one keyframe where frames arrive faster than the disk writes.
     pub fn start(
         writer: MapWriter,
         camera: Intrinsics,
@@ -89,7 +89,7 @@ impl MapKeeper {
         })
     }
 
-    /// Hands over what a step or a correction has changed.
+    /// Hands over what a step or a correction changed.
     pub fn follow(&mut self, mapper: &Mapper, outcome: &StepOutcome) {
         if !(outcome.needs_image() || outcome.graph_changed) {
             return;
@@ -127,7 +127,7 @@ impl MapKeeper {
         self.shared.wake.notify_one();
     }
 
-    /// Writes all that is not on the disk yet, before it returns. `each` is called before each keyframe: it may take
+    /// Writes everything that is not on disk yet, before it returns. Calls `each` before each keyframe, as it may take
     /// longer than a process may be silent.
     pub fn save_all(
         &mut self,
@@ -137,7 +137,7 @@ impl MapKeeper {
         let mut writer = locked(&self.shared.writer);
         let mut waiting = locked(&self.shared.waiting);
         waiting.head = None;
-        // What waits is older than what is written now, and what was written in vain is written again.
+        // Waiting keyframes are older than those written now, and those that failed are written again.
         for keyframe_id in std::mem::take(&mut waiting.keyframes).into_keys() {
             self.handed.remove(&keyframe_id);
         }
@@ -161,13 +161,13 @@ impl MapKeeper {
         writer.settle()
     }
 
-    /// Why the last save failed; told once.
+    /// Takes the reason why the last save failed.
     pub fn take_failure(&mut self) -> Option<String> {
         locked(&self.shared.waiting).failure.take()
     }
 }
 
-/// Whether a keyframe has what a file would hold.
+/// Whether a keyframe has the contents of a file.
 pub(super) fn is_kept(keyframe: &Keyframe, camera: &Intrinsics) -> bool {
     keyframe.has_depth()
         && keyframe.map_state == MapState::Established
@@ -196,7 +196,7 @@ pub(super) fn head_of(mapper: &Mapper) -> MapHead {
     }
 }
 
-/// What is behind it is whole between any two of its changes, also where a thread has panicked.
+/// The data is consistent between any two of its changes, even where a thread has panicked.
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -219,7 +219,7 @@ fn save_until_over(shared: &Shared, camera: &Intrinsics) {
     }
 }
 
-/// One save of what waits.
+/// Saves what waits, once.
 fn save_waiting(shared: &Shared, camera: &Intrinsics) {
     let mut writer = locked(&shared.writer);
     let mut waiting = locked(&shared.waiting);

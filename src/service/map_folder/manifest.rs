@@ -1,15 +1,15 @@
-//! The manifest of a map folder: which keyframes there are, where they are, and which file holds the depth of each.
+//! The manifest of a map folder: the keyframes, their poses, and the file that holds the depth of each.
 //!
 //! Layout, little-endian: magic, version (u32), then sections: tag (4 bytes), bytes (u64), payload; at the end the
-//! CRC-32 of all before it (u32). A section that this program does not know is left out where its tag begins with a
-//! lower-case letter, and makes the map one of another version otherwise.
+//! CRC-32 of everything before it (u32). An unknown section is skipped if its tag begins with a lower-case letter;
+//! otherwise the map is of another version.
 //!
 //! * `CAMR`: width, height (u32), fx, fy, cx, cy (f64).
 //! * `STAT`: detail (u32), first free epoch (u32), revision of the map, number of saves, seconds since 1970 (u64).
-//! * `loop`: loops, as in `loop_bytes`; left out where there are none.
-//! * `KEYF`: number of keyframes (u64), each: bytes (u32) of the keyframe without image and points as in
-//!   [`map_file`](crate::service::map_file), these; then, 0 where it has no file, revision in the file's name, bytes
-//!   (u64), checksum, number of points (u32) of its file.
+//! * `loop`: loops, as in `loop_bytes`; absent where there are none.
+//! * `KEYF`: number of keyframes (u64), each: byte count (u32) of the keyframe without image and points as in
+//!   [`map_file`](crate::service::map_file), these bytes; then, 0 where it has no file, revision in the file's name,
+//!   bytes (u64), checksum, number of points (u32) of its file.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -32,43 +32,43 @@ const CAMERA: [u8; 4] = *b"CAMR";
 const STATE: [u8; 4] = *b"STAT";
 const KEYFRAMES: [u8; 4] = *b"KEYF";
 const LOOPS: [u8; 4] = *b"loop";
-/// More keyframes than an hour at one each 30 ms: a broken number, not a map.
+/// More keyframes than an hour at one each 30 ms: an invalid number, not a map.
 const MAX_KEYFRAMES: usize = 120_000;
-/// Largest number of an epoch and of a revision: what comes after it must not overflow.
+/// Largest epoch and largest revision: later ones must not overflow.
 const MAX_EPOCH: u32 = u32::MAX / 2;
 const MAX_REVISION: u64 = u64::MAX / 2;
 
-/// What a folder holds.
+/// The contents of a map folder, except image and depth.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Manifest {
-    /// The camera that all keyframes were taken with.
+    /// The camera of all keyframes.
     pub camera: Intrinsics,
     /// How much of a keyframe is kept.
     pub detail: MapDetail,
-    /// Numbers of epochs from here on are given by nobody yet.
+    /// First epoch number that is not in use.
     pub free_epoch: u32,
     /// Loops of the map.
     pub loops: Arc<KnownLoops>,
-    /// How often the map had been corrected.
+    /// Number of corrections of the map.
     pub revision: u64,
-    /// How often it was saved.
+    /// Number of saves.
     pub saves: u64,
-    /// When it was saved last, seconds since 1970.
+    /// Time of the last save, seconds since 1970.
     pub saved_secs: u64,
-    /// Keyframes without image and points, in the order of their ids, with the file that has these.
+    /// Keyframes without image and points, ordered by id, with the file that holds these.
     pub keyframes: Vec<Listed>,
 }
 
-/// A keyframe of the list.
+/// A keyframe in the manifest.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Listed {
     /// The keyframe, without image and points.
     pub keyframe: Keyframe,
-    /// Where those are; `None` where they have not been written, or were given up.
+    /// The file that holds these; `None` where they have not been written, or were given up.
     pub file: Option<DepthFile>,
 }
 
-/// The file of a keyframe, as the list has it.
+/// The file of a keyframe, as the manifest lists it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, FromBytes, IntoBytes, Immutable)]
 #[repr(C)]
 pub struct DepthFile {
@@ -92,18 +92,18 @@ impl DepthFile {
 /// Why a manifest cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ManifestError {
-    /// It is something else.
+    /// It is not a manifest.
     #[error("it is not the manifest of a map")]
     Magic,
-    /// Another version has written it.
+    /// Another version wrote it.
     #[error(
         "the map is of version {0}, and this program reads version {VERSION}: use the program that made it"
     )]
     Version(u32),
-    /// It has a part that cannot be done without, which this program does not know.
+    /// It has a required section that is unknown to this program.
     #[error("the map has a part `{0}` that this program does not know: use a newer one")]
     Section(String),
-    /// A bit is wrong, or something is missing.
+    /// A bit is wrong, or a part is missing.
     #[error("it is damaged ({0})")]
     Damaged(String),
 }
@@ -127,7 +127,7 @@ impl Manifest {
         }
     }
 
-    /// Its bytes.
+    /// Encodes the manifest.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = MAGIC.to_vec();
         bytes.extend(VERSION.to_le_bytes());
@@ -153,7 +153,7 @@ impl Manifest {
         bytes
     }
 
-    /// The manifest of these bytes.
+    /// Decodes a manifest.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, ManifestError> {
         let mut rest = bytes;
         if take::<[u8; 16]>(&mut rest)? != MAGIC {
@@ -239,12 +239,12 @@ impl Manifest {
         if payload.is_empty() { Ok(()) } else { Err(damaged("bytes after the keyframes")) }
     }
 
-    /// Bytes of all files of keyframes.
+    /// Bytes of all keyframe files.
     pub fn depth_bytes(&self) -> u64 {
         self.keyframes.iter().filter_map(|listed| listed.file).map(|file| file.bytes).sum()
     }
 
-    /// Names of all files of keyframes.
+    /// Names of all keyframe files.
     pub fn file_names(&self) -> impl Iterator<Item = String> {
         let named = |listed: &Listed| Some(listed.file?.name(listed.keyframe.keyframe_id));
         self.keyframes.iter().filter_map(named)
@@ -299,7 +299,7 @@ mod tests {
         }
     }
 
-    /// With another body and a right checksum.
+    /// A body with its valid checksum.
     fn sealed(mut body: Vec<u8>) -> Vec<u8> {
         body.extend(crc32fast::hash(&body).to_le_bytes());
         body
@@ -312,14 +312,14 @@ mod tests {
     }
 
     #[test]
-    fn it_comes_back_from_its_bytes() {
+    fn a_manifest_survives_its_bytes() {
         assert_eq!(Manifest::from_bytes(&manifest().to_bytes()), Ok(manifest()));
         assert_eq!(manifest().depth_bytes(), 211);
         assert_eq!(manifest().file_names().collect::<Vec<_>>(), ["2.3", "9.3"]);
     }
 
     #[test]
-    fn loops_come_with_it_and_broken_ones_are_refused() {
+    fn loops_are_read_back_and_invalid_ones_are_refused() {
         let loops = Arc::new(crate::service::loop_bytes::tests::loops());
         let with = Manifest { loops, ..manifest() };
         assert_eq!(Manifest::from_bytes(&with.to_bytes()), Ok(with));
@@ -343,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_numbers_with_a_right_checksum_are_refused() {
+    fn invalid_numbers_with_a_valid_checksum_are_refused() {
         let last = body().len();
         for (at, value) in [
             (20 + 4, u64::MAX),    // length of the first section
@@ -364,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_unknown_is_left_out_or_asks_for_a_newer_program() {
+    fn an_unknown_section_is_skipped_or_requires_a_newer_program() {
         let with = |tag: &[u8; 4]| {
             let mut bytes = body();
             push_section(&mut bytes, *tag, b"something");

@@ -9,15 +9,15 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 /// Why a map cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum MapFolderError {
-    /// There is none.
+    /// The folder holds no map.
     #[error(
         "{0} holds no map: check the path, or begin one there with `semidense run SOURCE --map {0}`"
     )]
     Missing(PathBuf),
-    /// There is a file in its place.
+    /// The path is a file.
     #[error("{0} is a file; name a folder")]
     File(PathBuf),
-    /// The folder is full of other things.
+    /// The folder holds other things.
     #[error(
         "{0} is not a map, and not empty: name an empty folder, or one that does not exist yet"
     )]
@@ -25,7 +25,7 @@ pub enum MapFolderError {
     /// The folder holds a map that would be lost.
     #[error("{0} holds a map already: name another folder")]
     Taken(PathBuf),
-    /// There is nothing to be written.
+    /// The map has no keyframe yet.
     #[error("there is no map yet: no keyframe has been made")]
     Empty,
     /// It cannot be read.
@@ -33,18 +33,18 @@ pub enum MapFolderError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
-    /// What it holds cannot be used.
+    /// Its manifest cannot be used.
     #[error("{path}: {source}")]
     Manifest {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: ManifestError,
     },
-    /// Another camera took it.
+    /// It was taken with another camera.
     #[error(
         "{folder} is a map of another camera ({}): this one is {}; a map belongs to one camera and its calibration, so \
          name another folder",
@@ -56,15 +56,15 @@ pub enum MapFolderError {
         folder: PathBuf,
         /// Its camera.
         map: Box<Intrinsics>,
-        /// Ours.
+        /// The present camera.
         camera: Box<Intrinsics>,
     },
-    /// Another process writes it.
+    /// Another process is writing it.
     #[error("{folder} is being written by another process{by}: wait for it, or use --read-only")]
     Held {
         /// The map.
         folder: PathBuf,
-        /// Who, where that is known.
+        /// The other process, where known.
         by: String,
     },
     /// It cannot be written.
@@ -74,12 +74,12 @@ pub enum MapFolderError {
     Write {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
 }
 
-/// Refuses a map in `folder` that another camera than this one took.
+/// Refuses a map in `folder` that was taken with another camera.
 pub(super) fn check_same_camera(
     folder: &Path,
     map: &Intrinsics,

@@ -1,4 +1,4 @@
-//! Two maps in one folder.
+//! Merges two maps into one folder.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -11,8 +11,8 @@ use crate::service::map_folder::writer::MapHead;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 
-/// Writes a map that holds all epochs of `first` and, under numbers of their own, those of `second` into a folder that
-/// holds none. Where they lie against each other stays unknown: the camera is found in either.
+/// Writes a map that holds all epochs of `first` and, renumbered, those of `second` into a folder that holds none.
+/// Their relative pose stays unknown: the camera is located in either.
 pub fn merge(
     folder: &Path,
     first: Loaded,
@@ -32,7 +32,7 @@ pub fn merge(
     Ok(map)
 }
 
-/// Both maps, the ids and epochs of the second above those of the first.
+/// Joins both maps, with the ids and epochs of the second above those of the first.
 fn joined(first: Map, second: Map) -> Map {
     let newest = |number: fn(&Keyframe) -> u64| {
         first.keyframes.iter().map(number).max().map_or(0, |newest| newest.saturating_add(1))
@@ -58,7 +58,7 @@ mod tests {
     use crate::slam::geometry::sim3::Sim3;
 
     #[test]
-    fn no_number_of_the_second_map_is_one_of_the_first() {
+    fn merged_maps_share_no_numbers() {
         let camera = Intrinsics::pinhole(64, 48, 60.0);
         let keyframe = |keyframe_id: u64, epoch: u32| Keyframe {
             keyframe_id,

@@ -1,5 +1,5 @@
-//! Numbers of a map that a running mapper goes over to: no keyframe and no epoch of it has one that the run has given
-//! already, and on the disk it keeps its own.
+//! Numbers of a map that a running mapper switches to: in the run its keyframes and epochs get numbers that the run has
+//! not assigned yet, on disk they keep their own.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use crate::slam::loops::known::KnownLoops;
 use crate::slam::map::Map;
 use crate::slam::mapper::Mapper;
 
-/// By how much the numbers of a run are larger than those on the disk.
+/// Offset of the numbers of a run from those on disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Numbering {
     /// Of keyframes.
@@ -23,7 +23,7 @@ pub struct Numbering {
 }
 
 impl Numbering {
-    /// Numbers that a mapper has not given yet.
+    /// Above the numbers that a mapper has assigned.
     pub fn above(mapper: &Mapper) -> Self {
         Self {
             ids: mapper.free_keyframe_id(),
@@ -32,7 +32,7 @@ impl Numbering {
         }
     }
 
-    /// A map as the run numbers it.
+    /// A map in the numbers of the run.
     pub fn in_run(&self, map: Map) -> Map {
         let renumbered = |keyframe: Keyframe| Keyframe {
             keyframe_id: keyframe.keyframe_id.saturating_add(self.ids),
@@ -48,14 +48,14 @@ impl Numbering {
         }
     }
 
-    /// A keyframe as the disk numbers it; `None` for those that the run had before.
+    /// A keyframe in the numbers of the disk; `None` for those that the run had before.
     pub fn on_disk(&self, keyframe: Keyframe) -> Option<Keyframe> {
         let keyframe_id = keyframe.keyframe_id.checked_sub(self.ids)?;
         let epoch = keyframe.epoch.checked_sub(self.epochs)?;
         Some(Keyframe { keyframe_id, epoch, ..keyframe })
     }
 
-    /// What is in a manifest, as the disk numbers it.
+    /// The contents of a manifest in the numbers of the disk.
     pub fn head_on_disk(&self, head: MapHead) -> MapHead {
         if *self == Self::default() {
             return head;
@@ -77,7 +77,7 @@ mod tests {
     use crate::slam::geometry::sim3::Sim3;
 
     #[test]
-    fn a_map_is_on_the_disk_as_it_was_and_what_the_run_had_before_is_not() {
+    fn the_disk_keeps_its_numbers_and_omits_earlier_keyframes_of_the_run() {
         let camera = Intrinsics::pinhole(64, 48, 60.0);
         let keyframe = |keyframe_id: u64, epoch: u32| Keyframe {
             keyframe_id,

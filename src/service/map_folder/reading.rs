@@ -1,4 +1,4 @@
-//! Reads a map folder: the manifest, and what the files hold that it lists.
+//! Reads a map folder: the manifest, and the files it lists.
 
 use std::io;
 use std::path::Path;
@@ -18,25 +18,25 @@ use crate::slam::map::Map;
 pub(super) const MANIFEST: &str = "manifest";
 pub(super) const BEFORE: &str = "manifest.before";
 pub(super) const KEYFRAMES: &str = "keyframes";
-/// Largest manifest: that of the most keyframes has 80 MB.
+/// Largest manifest, bytes; that of the most keyframes has 80 MB.
 const MAX_MANIFEST_BYTES: u64 = 128 << 20;
-/// How often a map is read again whose files were replaced meanwhile.
+/// How often a map is read in all if its files are replaced meanwhile.
 const MAX_READS: usize = 3;
 
-/// A map that was read.
+/// A map as read from its folder.
 #[derive(Debug, Clone)]
 pub struct Loaded {
-    /// What the folder says.
+    /// The manifest of the folder.
     pub manifest: Manifest,
-    /// The map. Keyframes beyond the memory it may take have only their poses.
+    /// The map. Keyframes beyond the memory limit have only their poses.
     pub map: Map,
-    /// Keyframes that are left without depth, since it would take more memory.
+    /// Keyframes left without depth for want of memory.
     pub without_memory: usize,
-    /// What is damaged, a line for each file.
+    /// Damage, one line per file.
     pub problems: Vec<String>,
 }
 
-/// Reads a map. Image and depth of the newest keyframes that take at most `max_bytes` are read, with the threads of the
+/// Reads a map, with image and depth of the newest keyframes that take at most `max_bytes`, with the threads of the
 /// pool it is called in.
 pub fn load(folder: &Path, max_bytes: usize) -> Result<Loaded, MapFolderError> {
     let mut reads = 0;
@@ -44,7 +44,7 @@ pub fn load(folder: &Path, max_bytes: usize) -> Result<Loaded, MapFolderError> {
         reads += 1;
         let (manifest, mut problems) = read_manifest(folder)?;
         let (map, without_memory, files) = read_keyframes(folder, &manifest, max_bytes);
-        // Another process may have saved meanwhile, and removed what was listed.
+        // Another process may have saved meanwhile and removed listed files.
         let is_replaced = !files.is_empty() && read_manifest(folder)?.0 != manifest;
         if !is_replaced || reads == MAX_READS {
             problems.extend(files);
@@ -53,7 +53,7 @@ pub fn load(folder: &Path, max_bytes: usize) -> Result<Loaded, MapFolderError> {
     }
 }
 
-/// The manifest of a map, or the one before where that is damaged, and then what is.
+/// The manifest of a map, or the previous one where that is damaged, and the problems found.
 pub fn read_manifest(folder: &Path) -> Result<(Manifest, Vec<String>), MapFolderError> {
     let read = |name: &str| {
         let path = folder.join(name);
@@ -70,7 +70,7 @@ pub fn read_manifest(folder: &Path) -> Result<(Manifest, Vec<String>), MapFolder
         Err(error) => error,
     };
     refuse_file(folder)?;
-    // What a newer program has written is not to be taken for what an older one has left beside it.
+    // A map that a newer program wrote must not be replaced by one that an older program left next to it.
     if let MapFolderError::Manifest {
         source: ManifestError::Version(_) | ManifestError::Section(_),
         ..
@@ -87,7 +87,7 @@ pub fn read_manifest(folder: &Path) -> Result<(Manifest, Vec<String>), MapFolder
     }
 }
 
-/// Refuses what is there and is not a folder: what the system says of files below it would not tell.
+/// Refuses a path that is not a folder: the system's errors on files below it would not tell.
 pub(super) fn refuse_file(folder: &Path) -> Result<(), MapFolderError> {
     match folder.metadata() {
         Ok(metadata) if !metadata.is_dir() => Err(MapFolderError::File(folder.to_owned())),
@@ -95,7 +95,7 @@ pub(super) fn refuse_file(folder: &Path) -> Result<(), MapFolderError> {
     }
 }
 
-/// The keyframes of a manifest with their depth, how many are left without it for want of memory, and what is damaged.
+/// The keyframes of a manifest with their depth, how many are without it for want of memory, and the problems found.
 fn read_keyframes(
     folder: &Path,
     manifest: &Manifest,
@@ -135,7 +135,7 @@ fn read_keyframes(
     (map, without_memory, problems.into_iter().flatten().collect())
 }
 
-/// Gives a keyframe what its file holds; otherwise a line that says which file is damaged, and how.
+/// Gives a keyframe the contents of its file; otherwise returns a line that names the damaged file and the fault.
 fn read_depth(folder: &Path, file: &DepthFile, keyframe: &mut Keyframe) -> Result<(), String> {
     let path = folder.join(KEYFRAMES).join(file.name(keyframe.keyframe_id));
     let id = keyframe.keyframe_id;
@@ -146,7 +146,7 @@ fn read_depth(folder: &Path, file: &DepthFile, keyframe: &mut Keyframe) -> Resul
     let mut bytes = Vec::with_capacity(usize::try_from(file.bytes).unwrap_or(0));
     input_file::read_into(&path, most_bytes(num_pixels) as u64, &mut bytes)
         .map_err(|error| told(&error))?;
-    // A whole file of another time has a right checksum of its own.
+    // An intact file of another save has a valid checksum too.
     if checksum_of(&bytes) != file.checksum {
         return Err(told(&DepthFileError::Checksum));
     }

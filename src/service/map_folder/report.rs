@@ -1,4 +1,4 @@
-//! What a map folder holds, for whoever asks.
+//! Reports the contents of a map folder.
 
 use std::fs;
 use std::io;
@@ -19,40 +19,40 @@ use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 use crate::slam::trajectory::StampedPose;
 
-/// What a folder holds. Lengths are those of its epoch, whose unit the map has chosen.
+/// The contents of a map folder. Lengths are in the unit of their epoch, which the map has chosen.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct MapReport {
     /// Version of the format.
     pub version: u32,
     /// How much of a keyframe is kept.
     pub detail: MapDetail,
-    /// Size of its images, pixels.
+    /// Width of its images, pixels.
     pub width: usize,
-    /// The same.
+    /// Height of its images, pixels.
     pub height: usize,
     /// Rectified intrinsics: fx, fy, cx, cy, pixels.
     pub intrinsics: [f64; 4],
     /// Keyframes of each epoch.
     pub epochs: Vec<EpochReport>,
-    /// Keyframes in all.
+    /// Total number of keyframes.
     pub keyframes: usize,
-    /// Of them those whose depth can be read.
+    /// Keyframes whose depth can be read.
     pub keyframes_with_depth: usize,
     /// Points of all keyframes.
     pub points: usize,
-    /// How often the map was corrected.
+    /// Number of corrections of the map.
     pub revision: u64,
-    /// How often it was saved.
+    /// Number of saves.
     pub saves: u64,
-    /// When it was saved last, seconds since 1970.
+    /// Time of the last save, seconds since 1970.
     pub saved_secs: u64,
-    /// Bytes that the folder takes.
+    /// Size of the folder, bytes.
     pub bytes: u64,
-    /// What is damaged, a line for each file.
+    /// Damage, one line per file.
     pub problems: Vec<String>,
 }
 
-/// An epoch: it has a unit and a place of its own.
+/// An epoch, with a separate unit and world.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EpochReport {
     /// Its number.
@@ -64,7 +64,7 @@ pub struct EpochReport {
 }
 
 impl MapReport {
-    /// Of a map that was read with all of its depth.
+    /// Reports a map that was read with all of its depth.
     pub fn of(folder: &Path, loaded: &Loaded) -> Self {
         let Loaded { manifest, map, problems, .. } = loaded;
         let k = &manifest.camera;
@@ -108,8 +108,8 @@ fn bytes_in(folder: &Path) -> u64 {
     files.map(|metadata| metadata.len()).sum()
 }
 
-/// Writes a map's points (PLY, on request PCD and every point) and the trajectory of its keyframes (TUM), of one epoch: how
-/// many of each. `progress` is called with how many keyframes are fused, of how many.
+/// Writes the points (PLY, on request PCD and every point) and the keyframe trajectory (TUM) of one epoch; returns the
+/// number of each. Calls `progress` with the number of keyframes fused so far, and of all.
 pub fn export(
     folder: &Path,
     map: &Map,

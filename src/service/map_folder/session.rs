@@ -1,4 +1,4 @@
-//! A process's use of a map folder: read at its start, kept while it maps, whole at its end.
+//! A process's use of a map folder: read at its start, kept while it maps, complete at its end.
 
 use std::path::{Path, PathBuf};
 
@@ -19,25 +19,25 @@ pub enum MapSessionError {
     /// The folder cannot be read or written.
     #[error(transparent)]
     Folder(#[from] MapFolderError),
-    /// The map cannot be begun in.
+    /// A mapper cannot begin in the map.
     #[error("{folder}: {source}")]
     Prior {
         /// The map.
         folder: PathBuf,
-        /// Why.
+        /// The cause.
         source: PriorError,
     },
-    /// No thread.
+    /// The thread cannot be started.
     #[error("cannot start the thread that saves the map ({0})")]
     Thread(std::io::Error),
 }
 
-/// A map that is used.
+/// A map in use.
 #[derive(Debug)]
 pub struct MapSession {
     folder: PathBuf,
     map_use: MapUse,
-    /// Until the camera is known.
+    /// Held until the camera is known.
     loaded: Option<Map>,
     camera: Option<Intrinsics>,
     writer: Option<MapWriter>,
@@ -48,8 +48,8 @@ pub struct MapSession {
 
 impl MapSession {
     /// Reads the map that the configuration names, with the threads of the pool it is called in; `None` where it names
-    /// none. What is damaged is told in the log. `waits`: frames may wait for the disk. The run gives other numbers than
-    /// the disk where it had a map before.
+    /// none. Damage is logged. `waits`: frames may wait for the disk. The run's numbers differ from the disk's where it
+    /// had a map before.
     pub fn open(
         config: &MapConfig,
         max_bytes: usize,
@@ -76,8 +76,8 @@ impl MapSession {
         Ok(Some(Self { folder, map_use, loaded, camera, writer, keeper, numbering, waits }))
     }
 
-    /// Lets a mapper of `camera` begin in the map, before its first frame; where one that died has `left` a checkpoint and
-    /// the map continues, it continues from that.
+    /// Lets a mapper of `camera` begin in the map, before its first frame; where a dead mapper has `left` a checkpoint
+    /// and the map continues, the mapper continues from that.
     pub fn begin(
         &mut self,
         mapper: &mut Mapper,
@@ -104,18 +104,18 @@ impl MapSession {
         Ok(StepOutcome::default())
     }
 
-    /// Whether it is the map in a folder; an empty name is that of every one.
+    /// Whether it is the map in `folder`; an empty path matches any map.
     pub fn is_in(&self, folder: &Path) -> bool {
         let same = || Some(folder.canonicalize().ok()? == self.folder.canonicalize().ok()?);
         folder.as_os_str().is_empty() || same().unwrap_or(false)
     }
 
-    /// Keeps what a step or a correction has changed.
+    /// Keeps what a step or a correction changed.
     pub fn follow(&mut self, mapper: &Mapper, outcome: &StepOutcome) {
         self.keeper.iter_mut().for_each(|keeper| keeper.follow(mapper, outcome));
     }
 
-    /// Writes all that is not on the disk yet, before it returns; nothing where the map stays as it is. `each` is called
+    /// Writes everything that is not on disk yet, before it returns; nothing where the map is not kept. Calls `each`
     /// before each keyframe.
     pub fn save_all(
         &mut self,
@@ -126,13 +126,13 @@ impl MapSession {
         Ok(keeper.save_all(mapper, each)?)
     }
 
-    /// Why the last save failed; told once.
+    /// Takes the reason why the last save failed.
     pub fn take_failure(&mut self) -> Option<String> {
         self.keeper.as_mut()?.take_failure()
     }
 }
 
-/// Checks a map before anything is started: whether it can be read, or begun.
+/// Checks, before anything is started, that a map can be read or begun.
 pub fn check(config: &MapConfig) -> Result<(), MapFolderError> {
     if config.folder.is_empty() {
         return Ok(());
@@ -144,19 +144,19 @@ pub fn check(config: &MapConfig) -> Result<(), MapFolderError> {
     }
 }
 
-/// Checks that a map that is there is of this camera, before anything is started.
+/// Checks, before anything is started, that an existing map is of this camera.
 pub fn check_camera(config: &MapConfig, camera: &Intrinsics) -> Result<(), MapFolderError> {
     if config.folder.is_empty() {
         return Ok(());
     }
     match check_loadable(Path::new(&config.folder), camera) {
-        // It is to be begun, or a check before has refused it.
+        // It is to be begun, or an earlier check has refused it.
         Err(MapFolderError::Missing(_)) => Ok(()),
         checked => checked,
     }
 }
 
-/// Checks that a folder holds a map of this camera that a running mapper could go over to.
+/// Checks that a folder holds a map of this camera that a running mapper could switch to.
 pub fn check_loadable(folder: &Path, camera: &Intrinsics) -> Result<(), MapFolderError> {
     let (manifest, _) = read_manifest(folder)?;
     check_same_camera(folder, &manifest.camera, camera)

@@ -1,4 +1,4 @@
-//! A map on disk comes back as it was, and what is damaged costs nothing but itself.
+//! A map on disk is read back unchanged, and damage costs only the damaged part.
 
 use std::fs;
 use std::path::PathBuf;
@@ -44,7 +44,7 @@ fn head(keyframes: &[Keyframe]) -> MapHead {
     MapHead { keyframes, revision: 6, free_epoch: 4, loops: Arc::default() }
 }
 
-/// Saves keyframes, all of them with their depth.
+/// Saves keyframes, all with their depth.
 fn save(writer: &mut MapWriter, keyframes: &[Keyframe]) {
     keyframes.iter().for_each(|keyframe| writer.put(keyframe).unwrap());
     writer.save(&CAMERA, head(keyframes)).unwrap();
@@ -54,7 +54,7 @@ fn open(folder: &Path) -> MapWriter {
     MapWriter::open(folder, MapDetail::Full).unwrap()
 }
 
-/// Names of everything in a folder, and what it is.
+/// Paths and contents of all files in a folder.
 fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder).unwrap().flatten() {
@@ -72,7 +72,7 @@ fn num_files(folder: &Path) -> usize {
 }
 
 #[test]
-fn a_map_comes_back_with_the_same_bits() {
+fn a_map_is_read_back_bit_for_bit() {
     let folder = tempfile::tempdir().unwrap();
     let keyframes: Vec<Keyframe> = (0..5).map(|id| keyframe(id * 3, 1)).collect();
     save(&mut open(folder.path()), &keyframes);
@@ -85,7 +85,7 @@ fn a_map_comes_back_with_the_same_bits() {
 }
 
 #[test]
-fn a_file_in_the_place_of_the_folder_is_named_as_one() {
+fn a_file_in_place_of_the_folder_is_reported_as_such() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("afile");
     fs::write(&file, "x").unwrap();
@@ -95,7 +95,7 @@ fn a_file_in_the_place_of_the_folder_is_named_as_one() {
 }
 
 #[test]
-fn a_save_writes_what_has_changed_and_removes_what_nobody_lists() {
+fn a_save_writes_changes_and_removes_unlisted_files() {
     let folder = tempfile::tempdir().unwrap();
     let mut writer = open(folder.path());
     let mut keyframes: Vec<Keyframe> = (0..4).map(|id| keyframe(id, 1)).collect();
@@ -113,14 +113,14 @@ fn a_save_writes_what_has_changed_and_removes_what_nobody_lists() {
     save(&mut writer, &keyframes);
     assert_eq!(num_files(folder.path()), 4);
     assert!(load(folder.path(), ALL).unwrap().map.keyframes == keyframes);
-    // One that has contradicted itself is left out, one without depth keeps its file.
+    // A rejected keyframe is left out, one without depth keeps its file.
     keyframes[0].map_state = MapState::Rejected;
     writer.save(&CAMERA, head(&keyframes)).unwrap();
     assert!(load(folder.path(), ALL).unwrap().map.keyframes == keyframes[1..]);
 }
 
 #[test]
-fn the_next_process_goes_on_with_the_same_files() {
+fn the_next_process_continues_with_the_same_files() {
     let folder = tempfile::tempdir().unwrap();
     let keyframes: Vec<Keyframe> = (0..3).map(|id| keyframe(id, 1)).collect();
     save(&mut open(folder.path()), &keyframes);
@@ -156,7 +156,7 @@ fn a_damaged_keyframe_costs_its_depth_and_nothing_else() {
     for (problem, name) in loaded.problems.iter().zip(["0.1", "1.1", "3.1"]) {
         assert!(problem.contains(name) && problem.lines().count() == 1, "{problem}");
     }
-    // All of it cut at any length.
+    // All of it, cut at many lengths.
     let whole = fs::read(path("2.1")).unwrap();
     for length in (0..whole.len()).step_by(97) {
         fs::write(path("2.1"), &whole[..length]).unwrap();
@@ -165,7 +165,7 @@ fn a_damaged_keyframe_costs_its_depth_and_nothing_else() {
 }
 
 #[test]
-fn a_damaged_description_is_made_again_and_costs_nothing_else() {
+fn a_damaged_description_is_recomputed_and_costs_nothing_else() {
     let folder = tempfile::tempdir().unwrap();
     let scene = Scene::new(3);
     let mut kept = scene.keyframe(0, SE3::identity(), 1.0);
@@ -209,10 +209,10 @@ fn a_damaged_manifest_costs_the_last_save() {
     let loaded = load(folder.path(), ALL).unwrap();
     assert!(loaded.map.keyframes == first);
     assert!(loaded.problems[0].contains("damaged"), "{:?}", loaded.problems);
-    // What a process that was killed between the two has left.
+    // As left by a process killed between the two.
     fs::remove_file(&path).unwrap();
     assert!(load(folder.path(), ALL).unwrap().map.keyframes == first);
-    // Nothing is written over a map that cannot be read.
+    // A map that cannot be read is not overwritten.
     fs::write(folder.path().join(BEFORE), "semidense").unwrap();
     fs::write(&path, &bytes).unwrap();
     assert!(load(folder.path(), ALL).is_err());
@@ -232,7 +232,7 @@ fn memory_goes_to_the_newest_keyframes() {
 }
 
 #[test]
-fn what_is_no_map_is_said_in_a_line() {
+fn a_missing_or_invalid_map_gives_a_one_line_error() {
     let folder = tempfile::tempdir().unwrap();
     let missing = load(folder.path(), ALL).unwrap_err().to_string();
     assert!(missing.contains("holds no map"), "{missing}");

@@ -20,38 +20,38 @@ use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::loops::known::KnownLoops;
 use crate::wire::lock_file::{LockFile, Locking};
 
-/// What of a map is in its manifest.
+/// The part of a map that its manifest holds.
 #[derive(Debug, Clone, Default)]
 pub struct MapHead {
-    /// Keyframes without image and points, in the order of their ids.
+    /// Keyframes without image and points, ordered by id.
     pub keyframes: Vec<Keyframe>,
     /// Its loops.
     pub loops: Arc<KnownLoops>,
-    /// How often the map was corrected.
+    /// Number of corrections of the map.
     pub revision: u64,
-    /// Numbers of epochs from here on are given by nobody yet.
+    /// First epoch number that is not in use.
     pub free_epoch: u32,
 }
 
-/// A map folder that this process alone writes.
+/// A map folder that only this process writes.
 #[derive(Debug)]
 pub struct MapWriter {
     folder: PathBuf,
-    /// As saved last; `None` where nothing has been saved.
+    /// The manifest saved last; `None` where nothing has been saved.
     manifest: Option<Manifest>,
     /// Its bytes.
     manifest_bytes: Vec<u8>,
     detail: MapDetail,
-    /// Files of keyframes, by their id, that the next manifest lists.
+    /// Keyframe files that the next manifest lists, by id.
     files: BTreeMap<u64, DepthFile>,
-    /// Names of the files there are.
+    /// Names of the existing files.
     names: BTreeSet<String>,
     _lock: LockFile,
 }
 
 impl MapWriter {
-    /// Takes a folder for this process: one that holds a map, or is empty, or does not exist yet. A map that is there
-    /// keeps its detail.
+    /// Claims a folder for this process: one that holds a map, is empty, or does not exist yet. An existing map keeps
+    /// its detail.
     pub fn open(folder: &Path, detail: MapDetail) -> Result<Self, MapFolderError> {
         let failed = |source| MapFolderError::Write { path: folder.to_owned(), source };
         refuse_file(folder)?;
@@ -85,7 +85,7 @@ impl MapWriter {
         Ok(writer)
     }
 
-    /// Removes what a killed process has left, and lists what there is.
+    /// Removes what a killed process left, and lists the existing files.
     fn tidy(&mut self) -> io::Result<()> {
         let is_unfinished = |name: &str| name.starts_with('.') && name.ends_with(".tmp");
         for entry in fs::read_dir(&self.folder)?.flatten() {
@@ -102,13 +102,13 @@ impl MapWriter {
         Ok(())
     }
 
-    /// The camera of the map that is there.
+    /// The camera of the existing map.
     pub fn camera(&self) -> Option<&Intrinsics> {
         self.manifest.as_ref().map(|manifest| &manifest.camera)
     }
 
-    /// Writes image and depth of a keyframe, unless they are on the disk as they are. They belong to the map with the
-    /// next [`Self::save`].
+    /// Writes image and depth of a keyframe, unless they are unchanged on disk. They enter the map with the next
+    /// [`Self::save`].
     pub fn put(&mut self, keyframe: &Keyframe) -> Result<(), MapFolderError> {
         let bytes = encode(keyframe, self.detail);
         let file = DepthFile {
@@ -117,7 +117,7 @@ impl MapWriter {
             checksum: checksum_of(&bytes),
             num_points: keyframe.points.len() as u32,
         };
-        // A new revision may be of the pose alone.
+        // A new revision may change only the pose.
         let is_same =
             |known: &DepthFile| (known.bytes, known.checksum) == (file.bytes, file.checksum);
         if self.files.get(&keyframe.keyframe_id).is_some_and(is_same) {
@@ -132,7 +132,7 @@ impl MapWriter {
         Ok(())
     }
 
-    /// Writes the manifest: from now on the map is this. Keyframes of another camera, those that contradicted themselves
+    /// Writes the manifest, which makes this the map. Keyframes of another camera, those that contradicted themselves
     /// and those whose depth was never written are left out.
     pub fn save(&mut self, camera: &Intrinsics, head: MapHead) -> Result<(), MapFolderError> {
         let is_kept = |keyframe: &Keyframe| {
@@ -162,14 +162,14 @@ impl MapWriter {
         Ok(())
     }
 
-    /// The manifest before becomes this one too, at the end: the files of changed keyframes are there once.
+    /// At the end: overwrites the previous manifest with this one, so that changed keyframes have one file each.
     pub fn settle(&mut self) -> Result<(), MapFolderError> {
         self.write(BEFORE, &self.manifest_bytes)?;
         self.remove_unlisted(None);
         Ok(())
     }
 
-    /// Writes a manifest; an empty one is none.
+    /// Writes a manifest, unless it is empty.
     fn write(&self, name: &str, bytes: &[u8]) -> Result<(), MapFolderError> {
         if bytes.is_empty() {
             return Ok(());
@@ -179,12 +179,12 @@ impl MapWriter {
             .map_err(|source| MapFolderError::Write { path, source })
     }
 
-    /// Removes the files that neither this manifest nor the one before lists.
+    /// Removes the files that neither this manifest nor the previous one lists.
     fn remove_unlisted(&mut self, before: Option<&Manifest>) {
         let manifests = self.manifest.iter().chain(before);
         let listed: BTreeSet<String> = manifests.flat_map(Manifest::file_names).collect();
         let folder = self.folder.join(KEYFRAMES);
-        // One that cannot be removed is removed by the next process that tidies up.
+        // A file that cannot be removed is left to the next process that tidies up.
         self.names
             .retain(|name| listed.contains(name) || fs::remove_file(folder.join(name)).is_err());
         let in_map = self.manifest.iter().flat_map(|manifest| &manifest.keyframes);
@@ -193,7 +193,7 @@ impl MapWriter {
     }
 }
 
-/// Whether a folder has nothing in it but what a process may have left that was killed before its first save.
+/// Whether a folder holds nothing but what a process killed before its first save may have left.
 fn is_free(folder: &Path) -> io::Result<bool> {
     for entry in fs::read_dir(folder)? {
         let name = entry?.file_name().to_string_lossy().into_owned();

@@ -1,4 +1,4 @@
-//! What the mapper does when it is asked: never on the frame path.
+//! Commands to the mapper, never carried out on the frame path.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -24,13 +24,13 @@ use crate::slam::mapper::Mapper;
 use crate::slam::mapper::situation::Situation;
 use crate::wire::command::Command;
 
-/// What a mapper says of itself while it reads another map, which may take long.
+/// Cause that a mapper reports while it reads another map, which may take long.
 const LOADS_MAP: &str = "another map is being loaded";
 /// Pause between two signs of life meanwhile.
 const LOADING_PAUSE: Duration = Duration::from_millis(20);
 const NO_FRAME: &str = "there is no map yet: no frame has come";
 
-/// What came of a command; an error is told to whoever gave it.
+/// Outcome of a command; an error is returned to its sender.
 type Answer = Result<(), Box<dyn Error>>;
 
 impl Shell<'_> {
@@ -49,7 +49,7 @@ impl Shell<'_> {
         })?)
     }
 
-    /// Does what may take longer than the pause between two signs of life.
+    /// Reports `cause` during an act that may take longer than the pause between two signs of life.
     fn saying(&mut self, cause: &str, act: impl FnOnce(&mut Self) -> Answer) -> Result<(), String> {
         let before = self.health.entered();
         self.health.enter(ProcessState::Running, cause);
@@ -59,7 +59,7 @@ impl Shell<'_> {
     }
 
     fn save_map(&mut self, path: &Path) -> Answer {
-        // It is asked for when the recording is over.
+        // It is requested when the recording is over.
         if let Some((_, mapper)) = &mut self.mapper {
             let outcome = self.adjustments.finish(mapper);
             self.output.publish(mapper, &outcome)?;
@@ -84,7 +84,7 @@ impl Shell<'_> {
         Ok(save_copy(path, mapper, detail, &mut || health.report())?)
     }
 
-    /// Goes over to the map in another folder. Whatever is wrong with that, the map at hand continues as it is.
+    /// Switches to the map in another folder. On any error the current map continues unchanged.
     fn load_folder(&mut self, folder: PathBuf, read_only: bool) -> Answer {
         let Some((camera, mapper)) = &self.mapper else { return Err(NO_FRAME.into()) };
         let (camera, numbering) = (*camera, Numbering::above(mapper));
@@ -112,7 +112,7 @@ impl Shell<'_> {
         Ok(())
     }
 
-    /// A mapper that begins in a map, which is read beside signs of life.
+    /// Makes a mapper that begins in a map, which is read while signs of life continue.
     fn begin_in(
         &mut self,
         map: &MapConfig,
@@ -145,7 +145,7 @@ impl Shell<'_> {
         })
     }
 
-    /// Live: who comes after begins in the other map, not with what was left of this one.
+    /// Live: a successor begins in the other map, not with what was left of this one.
     fn forget_checkpoint(&mut self, gone_over: &GoneOver) -> Result<(), String> {
         let Some(mut kept) = self.kept.take() else { return Ok(()) };
         let (path, note) = (self.place.checkpoint_path(), self.place.loaded_map_path());

@@ -1,4 +1,4 @@
-//! Which map a running mapper has gone over to, for the one that comes after it if it dies.
+//! The map that a running mapper has switched to, for its successor if it dies.
 
 use std::fs;
 use std::io::{self, Write};
@@ -11,14 +11,14 @@ use crate::service::atomic_file::write_privately;
 use crate::service::config::MapConfig;
 use crate::service::map_folder::numbering::Numbering;
 
-/// Longest file: a path of the longest kind, every byte of it escaped.
+/// Largest file, bytes: a path of maximal length, every byte of it escaped.
 const MAX_BYTES: u64 = 1 << 15;
 
 /// A map that a mapper was not started with.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct GoneOver {
-    /// The folder of the configuration that it was started with: one that is started with another stays there.
+    /// The folder configured when the mapper was started: a successor started with another one stays there.
     pub(super) from: String,
     /// The map.
     pub(super) to: MapConfig,
@@ -27,7 +27,7 @@ pub(super) struct GoneOver {
 }
 
 impl GoneOver {
-    /// What the mapper before has left at `path`, where it was started as this one is.
+    /// Reads what the previous mapper left at `path`, if it was started like this one.
     pub(super) fn read(path: &Path, configured: &MapConfig) -> Option<Self> {
         let mut bytes = Vec::new();
         match input_file::read_into(path, MAX_BYTES, &mut bytes) {
@@ -45,15 +45,15 @@ impl GoneOver {
         read.ok().filter(|left| left.from == configured.folder)
     }
 
-    /// Leaves it at `path`.
+    /// Writes it to `path`.
     pub(super) fn write(&self, path: &Path) -> io::Result<()> {
         let bytes = serde_json::to_vec(self)?;
         write_privately(path, |file| file.write_all(&bytes))
     }
 
-    /// Nobody is to continue from there.
+    /// Removes it: no mapper is to continue from there.
     pub(super) fn forget(path: &Path) {
-        // What is not there need not be removed; of another configuration it is not read.
+        // A missing file need not be removed; one of another configuration is not read.
         drop(fs::remove_file(path));
     }
 }
@@ -63,7 +63,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_successor_goes_over_too_unless_it_was_started_with_another_map() {
+    fn a_successor_switches_too_unless_it_was_started_with_another_map() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rig.map");
         let config = |folder: &str| MapConfig { folder: folder.to_owned(), ..MapConfig::default() };

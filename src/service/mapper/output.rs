@@ -1,4 +1,4 @@
-//! What the mapper publishes: the active keyframe, the graph, steps, and earlier keyframes on request.
+//! Publishes the active keyframe, the graph, steps, and earlier keyframes on request.
 
 use crate::service::adjustments::AdjustmentRecord;
 use crate::service::adjustments::message::adjustment_message;
@@ -28,7 +28,7 @@ pub(super) struct Output {
     depths: Publisher<DepthPoint, KeyframeHeader>,
     graphs: Publisher<KeyframePoseMessage, GraphHeader>,
     earlier_depths: Publisher<DepthPoint, KeyframeHeader>,
-    /// Open from the first frame on: they must know the size of the images.
+    /// Opened with the first frame: they need the size of the images.
     images: Option<[Publisher<u8, KeyframeImageHeader>; 2]>,
 }
 
@@ -64,7 +64,7 @@ impl Output {
         self.images.iter().flatten().for_each(Publisher::serve_late_joiners);
     }
 
-    /// Image before depth: who sees the depth has the image.
+    /// Publishes the image before the depth: a subscriber that has the depth has the image.
     pub(super) fn publish(&self, mapper: &Mapper, outcome: &StepOutcome) -> Result<(), SendError> {
         let Some(keyframe) = mapper.keyframe() else { return Ok(()) };
         if outcome.needs_image() {
@@ -79,7 +79,7 @@ impl Output {
         Ok(())
     }
 
-    /// Sends a keyframe to whoever asked for it, or says why there is none to be sent.
+    /// Sends a requested keyframe, or returns why it cannot be sent.
     pub(super) fn publish_earlier(
         &self,
         map: Option<&Map>,
@@ -103,7 +103,7 @@ impl Output {
         self.adjustments.send((), &[adjustment_message(record)])
     }
 
-    /// After everything else of the frame: who sees the step has all.
+    /// After everything else of the frame: a subscriber that has the step has everything.
     pub(super) fn publish_step(
         &self,
         mapper: &Mapper,
@@ -140,7 +140,7 @@ impl Output {
         }
     }
 
-    /// The keyframes of the epoch; the newest where there are more than a message holds.
+    /// Publishes the keyframes of the epoch; the newest where a message cannot hold all.
     fn publish_graph(&self, map: &Map, newest: &Keyframe) -> Result<(), SendError> {
         let is_of_epoch = |keyframe: &&Keyframe| keyframe.epoch == newest.epoch;
         let count = map.keyframes.iter().filter(is_of_epoch).count();

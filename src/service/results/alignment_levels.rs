@@ -1,4 +1,4 @@
-//! What aligning costs on each pyramid level, over the frames of a run.
+//! Cost of alignment on each pyramid level, over the frames of a run.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,24 +6,24 @@ use crate::service::alignment_stamps::{AlignmentTrace, LevelTrace};
 use crate::slam::evaluation::statistics::percentiles;
 use crate::slam::image::sums::MAX_LEVELS;
 
-/// The frames that were aligned on one level.
+/// Frames aligned on one level.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct LevelSummary {
-    /// The level, 0 the finest.
+    /// The level; 0 is the finest.
     pub level: u32,
-    /// Frames that were aligned on it.
+    /// Number of frames aligned on it.
     pub frames: u64,
     /// Its points, median over the frames.
     pub points: f64,
-    /// Iterations a frame, median.
+    /// Iterations per frame, median.
     pub iterations_median: f64,
-    /// Iterations a frame, mean.
+    /// Iterations per frame, mean.
     pub iterations_mean: f64,
-    /// Nanoseconds a point and iteration, median over the frames; null where none is known.
+    /// Nanoseconds per point and iteration, median over the frames; null where none was timed.
     pub nanos_per_point: Option<f64>,
 }
 
-/// One for each level that frames were aligned on, finest first; `None` without any.
+/// One per level that frames were aligned on, finest first; `None` without any.
 pub fn alignment_levels(traces: &[AlignmentTrace]) -> Option<Vec<LevelSummary>> {
     let levels: Vec<_> = (0..MAX_LEVELS).filter_map(|level| summary_of(traces, level)).collect();
     (!levels.is_empty()).then_some(levels)

@@ -1,48 +1,47 @@
-//! Quality of a pose as a function of the budget: frames that were aligned again with fewer
-//! iterations, and the curve through them.
+//! Quality of a pose as a function of the budget: frames realigned with fewer iterations, and the curve through them.
 
 use serde::{Deserialize, Serialize};
 
 use crate::slam::evaluation::statistics::percentiles;
 
-/// Shares of the frames whose displacement is told: half of them, and most.
+/// Shares of the frames whose displacement is reported: half of them, and most.
 const SPREAD: [f64; 2] = [0.5, 0.9];
 
 /// One frame, aligned with one budget.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BudgetStep {
-    /// Iterations that were allowed, all levels together.
+    /// Allowed iterations, all levels together.
     pub iterations: u32,
-    /// Time that the whole frame took, image pyramid included.
+    /// Time of the whole frame, including the image pyramid.
     pub nanos: u64,
-    /// Mean distance of the keyframe's points in the image from where the pose without a limit puts
-    /// them, pixels of level 0.
+    /// Mean image distance of the keyframe's points from where the pose without a limit projects them, pixels of level
+    /// 0.
     pub displacement_px: f64,
 }
 
-/// One frame with growing budgets; the last is without a limit, so that its displacement is 0.
+/// One frame with growing budgets; the last has no limit, so that its displacement is 0.
 pub type BudgetSample = Vec<BudgetStep>;
 
-/// Displacements by budget over all frames that were aligned again, column by column.
+/// Displacements by budget over all realigned frames, column by column.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct BudgetCurve {
-    /// Iterations that were allowed.
+    /// Allowed iterations.
     pub iterations: Vec<u32>,
     /// Median time of a frame with that budget.
     pub track_ms_p50: Vec<f64>,
     /// Median over the frames of the mean displacement, pixels of level 0.
     pub displacement_px_p50: Vec<f64>,
-    /// The displacement that 90 of 100 frames do not exceed.
+    /// The displacement that 90 % of the frames do not exceed.
     pub displacement_px_p90: Vec<f64>,
 }
 
 impl BudgetCurve {
-    /// The curve through `samples`; `None` of none.
+    /// The curve through `samples`; `None` where there are none.
     pub fn of(samples: &[BudgetSample]) -> Option<Self> {
         let mut budgets: Vec<u32> = samples.iter().flatten().map(|step| step.iterations).collect();
         budgets.sort_unstable();
         budgets.dedup();
-        // The last step of a frame has as many iterations as it wants: no budget of others.
+        // The last step of a frame has no limit, so it is not a budget of other frames.
         budgets.retain(|&budget| budget == 0 || is_tried(budget));
         let mut curve = Self::default();
         for budget in budgets {
@@ -59,15 +58,14 @@ impl BudgetCurve {
     }
 }
 
-/// Whether a frame is aligned again with this budget: each of the first four, then two steps an
-/// octave.
+/// Whether frames are realigned with this budget: each of the first four, then two steps per octave.
 pub fn is_tried(iterations: u32) -> bool {
     let octave = iterations.checked_ilog2().unwrap_or(0);
     iterations <= 4 || iterations == 1 << octave || 2 * iterations == 3 << octave
 }
 
-/// Median and 90th percentile of the displacement that is reached within each of `times_ms`, where every frame
-/// has a pose by then.
+/// Median and 90th percentile of the displacement reached within each of `times_ms`, for times at which every frame has
+/// a pose.
 pub fn displacement_by_time(samples: &[BudgetSample], times_ms: &[f64]) -> Vec<(f64, [f64; 2])> {
     let at = |&time: &f64| {
         let nanos = (time * 1e6) as u64;
@@ -79,7 +77,7 @@ pub fn displacement_by_time(samples: &[BudgetSample], times_ms: &[f64]) -> Vec<(
     times_ms.iter().filter_map(at).collect()
 }
 
-/// The last step of a frame that is allowed; with a finer budget it had not come further.
+/// The last allowed step of a frame; a finer budget would not have got further.
 fn within(sample: &BudgetSample, is_allowed: impl Fn(&BudgetStep) -> bool) -> Option<&BudgetStep> {
     sample.iter().rev().find(|step| is_allowed(step))
 }
@@ -98,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_that_is_done_early_stays_where_it_is() {
+    fn a_frame_that_finishes_early_keeps_its_displacement() {
         let samples = [
             sample(&[(0, 4.0), (1, 2.0), (2, 0.0)]),
             sample(&[(0, 6.0), (1, 3.0), (2, 1.0), (3, 0.5), (4, 0.25), (5, 0.0)]),
@@ -116,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn budgets_are_tried_two_an_octave() {
+    fn two_budgets_are_tried_per_octave() {
         let tried: Vec<u32> = (0..=64).filter(|&n| is_tried(n)).collect();
         assert_eq!(tried, [0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64]);
     }

@@ -19,8 +19,8 @@ const RAINBOW: [Rgb; 9] = [
     [122, 4, 3],
 ];
 
-/// Stops of the scale for uncertainty and density, little to much: growing lightness, and none so
-/// dark that it is lost on a darkened image.
+/// Stops of the scale for uncertainty and density, low to high: increasing lightness, none too dark to be seen on a
+/// darkened image.
 const HEAT: [Rgb; 6] = [
     [60, 90, 220],
     [120, 90, 225],
@@ -43,7 +43,7 @@ pub fn heat(share: f64) -> Rgb {
 fn between(stops: &[Rgb], share: f64) -> Rgb {
     let last = stops.len() - 1;
     let place = share.clamp(0.0, 1.0) * last as f64;
-    // The cast takes NaN to 0.
+    // The cast maps NaN to 0.
     let lower = (place as usize).min(last - 1);
     let fraction = place - lower as f64;
     std::array::from_fn(|channel| {
@@ -64,7 +64,7 @@ pub struct Picture {
 }
 
 impl Picture {
-    /// Colours a pixel, where it is in the picture.
+    /// Colours a pixel if it lies in the picture.
     pub fn paint(&mut self, column: usize, row: usize, colour: Rgb) {
         if column < self.width && row < self.height {
             self.pixels[row * self.width + column] = colour;
@@ -82,7 +82,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn scales_meet_their_ends_and_survive_any_number() {
+    fn scales_reach_their_ends_and_accept_any_number() {
         assert_eq!(rainbow(0.0), RAINBOW[0]);
         assert_eq!(rainbow(1.0), RAINBOW[8]);
         assert_eq!(rainbow(0.125), RAINBOW[1]);
@@ -92,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_becomes_a_png_only_when_it_is_whole() {
+    fn only_a_complete_picture_becomes_a_png() {
         let picture = Picture { width: 3, height: 2, pixels: vec![[9; 3]; 6] };
         assert!(picture.png().unwrap().starts_with(b"\x89PNG"));
         assert_eq!(Picture { width: 4, ..picture }.png(), None);

@@ -1,4 +1,4 @@
-//! Pictures of every keyframe as files, for whoever works on the depth filter or the alignment.
+//! Pictures of every keyframe as files, for work on the depth filter or the alignment.
 
 use std::fs;
 use std::io::{self, Write};

@@ -6,7 +6,7 @@ use crate::service::results::record::RunRecord;
 use crate::slam::evaluation::depth_error::DepthErrors;
 use crate::slam::keyframe::{Keyframe, MapState};
 
-/// Compares every established keyframe of an epoch, whose unit is one, that has true depth.
+/// Compares every established keyframe with true depth in one epoch, which has one unit.
 pub fn evaluate_depth(
     record: &RunRecord,
     epoch: Option<u32>,
@@ -16,7 +16,7 @@ pub fn evaluate_depth(
     let of_epoch = record.map.keyframes.iter().filter(|k| Some(k.epoch) == epoch);
     for keyframe in of_epoch.filter(|k| is_evaluated(k)) {
         let true_depth = match source.depth_at(keyframe.capture_nanos) {
-            // One damaged file is no reason to lose the results.
+            // One damaged file must not cost the results.
             Err(error) if error.is_passing() => {
                 tracing::warn!("a keyframe is not compared with its true depth: {error}");
                 None
@@ -30,7 +30,7 @@ pub fn evaluate_depth(
     Ok(errors)
 }
 
-/// Whether a keyframe's depth is proven and still held.
+/// Whether a keyframe's depth is proven and still present.
 fn is_evaluated(keyframe: &Keyframe) -> bool {
     keyframe.map_state == MapState::Established && !keyframe.points.is_empty()
 }

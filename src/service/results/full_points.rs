@@ -1,4 +1,4 @@
-//! Every point of every keyframe as a point cloud, binary little-endian PLY: what the map's surface is made from.
+//! Every point of every keyframe as a point cloud, binary little-endian PLY: the input of the map's surface.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -10,7 +10,7 @@ use crate::slam::map::Map;
 
 /// Bytes of a point in the file.
 pub const FULL_POINT_BYTES: usize = 24;
-/// What the file begins with.
+/// Beginning of the file.
 pub const BEGINNING: &str =
     "ply\nformat binary_little_endian 1.0\ncomment every point of every keyframe";
 
@@ -25,14 +25,14 @@ fn points(map: &Map, max_relative_std_dev: f64) -> impl Iterator<Item = (&Keyfra
     all.filter(move |(_, point)| is_known(point, max_relative_std_dev))
 }
 
-/// Where the pixel (u, v) of a keyframe with this inverse depth is in the world, map units.
+/// Position in the map of the pixel (u, v) of a keyframe with this inverse depth, map units.
 pub(super) fn in_world(keyframe: &Keyframe, [u, v]: [u16; 2], inverse_depth: f32) -> [f32; 3] {
     let ray = keyframe.intrinsics.ray(f64::from(u), f64::from(v));
     let place = keyframe.map_from_keyframe * (ray / f64::from(inverse_depth));
     [place.x as f32, place.y as f32, place.z as f32]
 }
 
-/// Writes them, of all epochs: each has a place and a unit of its own, and `keyframes.txt` says which keyframe is of which.
+/// Writes them for all epochs: each has its own world and unit, and `keyframes.txt` has the epoch of each keyframe.
 pub fn write_full_points(path: &Path, map: &Map, max_relative_std_dev: f64) -> io::Result<()> {
     let count = num_points(map, max_relative_std_dev);
     write_atomically(path, |file| {

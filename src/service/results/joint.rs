@@ -1,4 +1,4 @@
-//! What the joint estimation of keyframes came to, in figures.
+//! Figures of the joint estimation of keyframes.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,28 +6,27 @@ use crate::service::adjustments::{AdjustmentRecord, Fate};
 use crate::service::results::times::Percentiles;
 use crate::slam::evaluation::statistics::percentiles;
 
-/// The joint estimates of a run. None where it is switched off, or there was no second keyframe.
+/// The joint estimates of a run. There are none where it is switched off, or without a second keyframe.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct JointSummary {
     /// Estimates that entered the map.
     pub adjustments: u64,
-    /// Of them those that entered a map with newer keyframes, which followed.
+    /// Those of them that entered a map with newer keyframes, which moved along.
     pub adjustments_merged: u64,
-    /// Estimates that were dropped because the map had changed: it was rejected, joined to another, or is one of
-    /// another camera.
+    /// Estimates dropped because the map had changed: it was rejected, joined to another, or belongs to another camera.
     pub adjustments_dropped: u64,
     /// CPU time of an estimate.
     pub adjustment_ms: Option<Percentiles>,
-    /// Most frames that went by between a keyframe and the entry of its estimate.
+    /// Most frames between a keyframe and the entry of its estimate.
     pub adjustment_frames_max: Option<u64>,
-    /// Median over the estimates of the share of comparisons, of a point with a keyframe, that agree.
+    /// Median over the estimates of the share of comparisons, each of a point with a keyframe, that agree.
     pub adjustment_inlier_ratio_median: Option<f64>,
     /// Median over the estimates of the root mean square of their residuals, grey levels.
     pub adjustment_rms_grey_median: Option<f64>,
 }
 
 impl JointSummary {
-    /// Of the estimates of a run.
+    /// Summarises the estimates of a run.
     pub fn of(records: &[AdjustmentRecord]) -> Self {
         let count = |fates: &[Fate]| {
             records.iter().filter(|record| fates.contains(&record.fate)).count() as u64

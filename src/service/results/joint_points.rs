@@ -33,7 +33,7 @@ pub fn write_points(path: &Path, map: &Map) -> io::Result<()> {
     })
 }
 
-/// Where a point is in the world, map units; `None` where its keyframe is gone.
+/// Position of a point in the map, map units; `None` where its keyframe is gone.
 fn position(map: &Map, point: &ConfirmedPoint) -> Option<[f32; 3]> {
     let keyframe = map.get(point.keyframe_id)?;
     let position = in_world(keyframe, [point.u, point.v], point.inverse_depth);

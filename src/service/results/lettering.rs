@@ -1,11 +1,11 @@
-//! Captions in pictures: lower-case letters of five by seven dots, and two below the line.
+//! Captions in pictures: lower-case letters of five by seven dots, with two more rows below the line.
 
 use crate::service::results::colour::{Picture, Rgb};
 
-/// Columns and rows of a letter, those below the line included.
+/// Columns and rows of a letter, including those below the line.
 const LETTER: [usize; 2] = [5, 9];
 
-/// From one letter to the next, dots.
+/// Dots from one letter to the next.
 const ADVANCE: usize = LETTER[0] + 1;
 
 /// Rows of each letter from the top, the leftmost dot in the highest of five bits.
@@ -59,8 +59,8 @@ pub fn text_size(text: &str, dot: usize) -> [usize; 2] {
     [(text.chars().count() * ADVANCE).saturating_sub(1) * dot, LETTER[1] * dot]
 }
 
-/// Writes `text` with its upper left corner at `left`, `top`; what is outside of the picture, and letters
-/// that there are none of, are left out.
+/// Writes `text` with its upper left corner at `left`, `top`; anything outside the picture, and letters without a
+/// glyph, are left out.
 pub fn write_text(
     picture: &mut Picture,
     [left, top]: [usize; 2],
@@ -87,7 +87,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn letters_keep_to_their_place_and_to_the_picture() {
+    fn letters_stay_in_place_and_within_the_picture() {
         let mut picture = Picture { width: 20, height: 12, pixels: vec![[0; 3]; 240] };
         write_text(&mut picture, [2, 1], 1, [9; 3], "l-");
         let rows: Vec<String> = picture

@@ -1,4 +1,4 @@
-//! What the search for loops came to, in figures.
+//! Figures of the search for loops.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,20 +6,20 @@ use crate::service::adjustments::SearchRecord;
 use crate::service::results::times::Percentiles;
 use crate::slam::loops::SearchFate;
 
-/// The search for loops in a run; none of it is known where a run does not tell.
+/// The search for loops in a run; all `None` where a run does not report it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct LoopSummary {
-    /// Keyframes that were looked for in older ones.
+    /// Keyframes that were searched for in older ones.
     pub loop_searches: Option<u64>,
     /// Pairs of keyframes that were compared.
     pub loop_pairs: Option<u64>,
     /// Loops that moved the map.
     pub loops_closed: Option<u64>,
-    /// Loops that the map already had so.
+    /// Loops that the map already satisfied.
     pub loops_held: Option<u64>,
     /// Epochs that were joined to others.
     pub epochs_joined: Option<u64>,
-    /// Places that looked alike and were further off than the map can have drifted.
+    /// Places that looked alike but were farther off than the map can have drifted.
     pub loops_against_drift: Option<u64>,
     /// Places that no second pair confirmed.
     pub loops_unconfirmed: Option<u64>,
@@ -29,12 +29,12 @@ pub struct LoopSummary {
     pub loops_refused: Option<u64>,
     /// CPU time of a search.
     pub loop_search_ms: Option<Percentiles>,
-    /// CPU time of all searches for each keyframe of the map, milliseconds.
+    /// CPU time of all searches per keyframe of the map, milliseconds.
     pub loop_search_ms_per_keyframe: Option<f64>,
 }
 
 impl LoopSummary {
-    /// Of the searches of a run whose map has so many keyframes.
+    /// Summarises the searches of a run whose map has `keyframes` keyframes.
     pub fn of(records: Option<&[SearchRecord]>, keyframes: usize) -> Self {
         let Some(records) = records else { return Self::default() };
         let count = |is: fn(&SearchFate) -> bool| {

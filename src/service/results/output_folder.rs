@@ -1,4 +1,4 @@
-//! Where the results of a run go: the folder that the user names, or a new one for each run.
+//! The output folder of a run: the one that the user names, or a new one for each run.
 
 use std::ffi::OsStr;
 use std::fs::{self, File};
@@ -14,7 +14,7 @@ use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::{finish_commit, foreign_file};
 use crate::wire::lock_file::{LockFile, Locking};
 
-/// Folder of the folders, below the one that the program is started in.
+/// Folder of the output folders, below the working directory.
 pub const PARENT: &str = "output";
 /// Name of the link to the newest folder.
 pub const LATEST: &str = "latest";
@@ -22,33 +22,32 @@ pub const LATEST: &str = "latest";
 /// Most runs that start in the same second in the same folder.
 const MAX_SAME_SECOND: u32 = 1000;
 
-/// The folder of a run's results, locked for this process. Where the program has made it, it is removed with the
-/// value if nothing was written.
+/// The folder of a run's results, locked for this process. If the program has made it, it is removed on drop when
+/// nothing was written.
 #[derive(Debug)]
 pub struct OutputFolder {
     path: PathBuf,
     /// Folders to remove if they stay empty, the innermost first.
     made: Vec<PathBuf>,
     kind: Kind,
-    /// Taken before the folders are removed.
+    /// Released before the folders are removed.
     lock: Option<LockFile>,
 }
 
-/// Where the folder's name comes from.
+/// Origin of the folder's name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
-    /// From the user.
+    /// Named by the user.
     Named,
-    /// From the time: it is of this run.
+    /// Named by the time: made for this run.
     New,
-    /// From a run that was killed and is recovered.
+    /// Named by a killed run that is being recovered.
     Recovered,
 }
 
 impl OutputFolder {
-    /// The folder that is `named`, else a new one in [`PARENT`], named by the second (UTC) of its making.
-    /// Checks that it can be written, so that a folder without room or permission is noticed before the run,
-    /// and locks it.
+    /// The folder `named`, else a new one in [`PARENT`], named by the second (UTC) of its creation. Checks that it can
+    /// be written, so that a lack of space or permission is noticed before the run, and locks it.
     pub fn prepare(named: Option<&Path>) -> Result<Self, ResultsError> {
         match named {
             Some(path) => Self::open(path, missing_folders(path), Kind::Named),
@@ -63,11 +62,11 @@ impl OutputFolder {
         }
     }
 
-    /// The folder of a run that was killed.
+    /// The folder of a killed run.
     pub fn of_recovery(path: &Path) -> Result<Self, ResultsError> {
         let mut made = missing_folders(path);
         if made.is_empty() && path.file_name().is_some_and(is_stamp) {
-            // Made by the run that was killed.
+            // Made by the killed run.
             made.push(path.to_owned());
         }
         Self::open(path, made, Kind::Recovered)
@@ -91,8 +90,8 @@ impl OutputFolder {
         &self.path
     }
 
-    /// Links [`LATEST`] to a folder that was made for the run, and to that of a recovered run unless a newer run
-    /// has the link. A `latest` of the user's own stays.
+    /// Links [`LATEST`] to a folder that was made for the run, and to that of a recovered run unless a newer run has
+    /// the link. Leaves a `latest` of the user's own alone.
     pub fn become_latest(&self) -> io::Result<()> {
         let (Some(parent), Some(name)) = (self.path.parent(), self.path.file_name()) else {
             return Ok(());
@@ -100,7 +99,7 @@ impl OutputFolder {
         let latest = parent.join(LATEST);
         let is_link = fs::symlink_metadata(&latest).map_or(true, |found| found.is_symlink());
         let is_newest = || match fs::read_link(&latest) {
-            // Names are in the order of time.
+            // Names sort by time.
             Ok(newest) => newest.as_os_str() <= name || !latest.exists(),
             Err(_) => true,
         };
@@ -122,19 +121,19 @@ impl OutputFolder {
 impl Drop for OutputFolder {
     fn drop(&mut self) {
         drop(self.lock.take());
-        // Only an empty folder can be removed so.
+        // This removes only empty folders.
         self.made.iter().for_each(|folder| drop(fs::remove_dir(folder)));
     }
 }
 
-/// The folders that have to be made for `folder`, itself first.
+/// The folders that must be made for `folder`, itself first.
 fn missing_folders(folder: &Path) -> Vec<PathBuf> {
     let named = |path: &&Path| !path.as_os_str().is_empty();
     let missing = folder.ancestors().take_while(named).take_while(|path| !path.exists());
     missing.map(Path::to_owned).collect()
 }
 
-/// Whether a folder has the name that [`new_folder`] gives.
+/// Whether a folder has a name as [`new_folder`] gives it.
 fn is_stamp(name: &OsStr) -> bool {
     const FORM: &[u8] = b"0000-00-00T00-00-00Z";
     let fits = |(byte, form): (&u8, &u8)| match form {
@@ -145,8 +144,8 @@ fn is_stamp(name: &OsStr) -> bool {
     bytes.len() >= FORM.len() && bytes.iter().zip(FORM).all(fits)
 }
 
-/// Makes the folder where it is missing, checks that it can be written and that it holds no file of the user's
-/// that results would replace, and finishes what a killed process has left half done.
+/// Makes the folder if it is missing, checks that it can be written and holds no user file that results would replace,
+/// and completes what a killed process left half done.
 pub fn prepare_output(folder: &Path) -> Result<(), ResultsError> {
     let attempt = || {
         fs::create_dir_all(folder)?;
@@ -164,12 +163,12 @@ fn write_error(path: &Path, source: io::Error) -> ResultsError {
     ResultsError::Write { path: path.to_path_buf(), source }
 }
 
-/// Writes a page into a file that has no name, so that nothing of it can remain.
+/// Writes a page into an unnamed file, so that nothing of it can remain.
 fn write_probe(folder: &Path) -> io::Result<()> {
     let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
     match rustix::fs::open(folder, flags, Mode::RUSR | Mode::WUSR) {
         Ok(file) => io::Write::write_all(&mut File::from(file), &[0; 4096]),
-        // Some file systems (NFS, FUSE) cannot: there the file loses its name at once.
+        // Some file systems (NFS, FUSE) cannot: there the file is unlinked at once.
         Err(rustix::io::Errno::OPNOTSUPP | rustix::io::Errno::ISDIR | rustix::io::Errno::INVAL) => {
             let probe = folder.join(format!(".semidense-write-test.{}", std::process::id()));
             let mut file = File::create(&probe)?;
@@ -195,12 +194,12 @@ fn new_folder(parent: &Path, stamp: &str) -> io::Result<PathBuf> {
     Err(io::ErrorKind::AlreadyExists.into())
 }
 
-/// `2026-11-22T03-15-00Z`: UTC, in order by name, and without a character that shells or Windows dislike.
+/// `2026-11-22T03-15-00Z`: UTC, sorted by name, without a character that shells or Windows dislike.
 pub fn utc_stamp(time: SystemTime) -> String {
     utc_text(time).replace(':', "-")
 }
 
-/// `2026-11-22T03:15:00Z`: UTC as RFC 3339 has it.
+/// `2026-11-22T03:15:00Z`: UTC in the form of RFC 3339.
 pub fn utc_text(time: SystemTime) -> String {
     const SECS_PER_DAY: u64 = 86_400;
     let secs = time.duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
@@ -210,8 +209,8 @@ pub fn utc_text(time: SystemTime) -> String {
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
 }
 
-/// Year, month and day of a number of days since 1970-01-01, in the Gregorian calendar: years are counted from
-/// March, so that the leap day is the last of its year.
+/// Gregorian year, month and day from the days since 1970-01-01. Years are counted from March, so that the leap day is
+/// the last of its year.
 fn date_of(days: u64) -> (u64, u64, u64) {
     const DAYS_PER_ERA: u64 = 146_097; // 400 years
     const DAYS_BEFORE_EPOCH: u64 = 719_468; // from 0000-03-01
@@ -250,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_that_was_made_goes_if_it_stays_empty_and_another_process_cannot_have_it() {
+    fn a_made_folder_is_locked_and_removed_if_it_stays_empty() {
         let root = tempfile::tempdir().unwrap();
         let outer = root.path().join("a");
         let inner = outer.join("b/c");
@@ -271,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn a_recovered_run_has_the_link_unless_a_newer_one_has_it() {
+    fn a_recovered_run_gets_the_link_unless_a_newer_run_has_it() {
         let root = tempfile::tempdir().unwrap();
         let latest = root.path().join(LATEST);
         let recover = |name: &str| {
@@ -291,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_of_the_same_second_have_folders_of_their_own() {
+    fn runs_of_the_same_second_have_separate_folders() {
         let folder = tempfile::tempdir().unwrap();
         let parent = folder.path().join("output");
         let make = || new_folder(&parent, "2026-11-22T03-15-00Z").unwrap();
@@ -306,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn the_link_follows_and_a_folder_that_stayed_empty_goes() {
+    fn the_link_follows_and_an_empty_folder_is_removed() {
         let folder = tempfile::tempdir().unwrap();
         let make = |stamp| {
             let path = new_folder(folder.path(), stamp).unwrap();
@@ -330,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_of_the_probe_remains_and_a_file_of_the_user_is_refused() {
+    fn the_probe_leaves_nothing_and_a_user_file_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         prepare_output(folder.path()).unwrap();
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);

@@ -7,10 +7,10 @@ use crate::wire::lock_file::{LockFile, Locking};
 
 /// Name of the lock file.
 const LOCK: &str = ".semidense-lock";
-/// Its permissions: what the user's mask leaves of them, as of every file of the folder.
+/// Its permissions, subject to the user's umask like those of every file of the folder.
 const MODE: u32 = 0o666;
 
-/// Locks `folder`, which exists. Does not wait.
+/// Locks `folder`, which must exist. Does not wait.
 pub fn lock_output(folder: &Path) -> io::Result<Locking> {
     LockFile::take(&folder.join(LOCK), MODE)
 }
@@ -24,7 +24,7 @@ mod tests {
     #[test]
     fn a_folder_is_locked_once_and_nothing_remains() {
         let folder = tempfile::tempdir().unwrap();
-        // As a killed process leaves it.
+        // As left by a killed process.
         fs::write(folder.path().join(LOCK), "4194304\nand more").unwrap();
         let Locking::Locked(lock) = lock_output(folder.path()).unwrap() else {
             panic!("nobody holds it")
@@ -39,7 +39,7 @@ mod tests {
     }
 
     #[test]
-    fn of_many_at_once_one_has_it() {
+    fn only_one_of_many_at_once_holds_it() {
         let folder = tempfile::tempdir().unwrap();
         let inside = std::sync::atomic::AtomicU32::new(0);
         std::thread::scope(|scope| {

@@ -1,4 +1,4 @@
-//! The surface of the map as a point cloud, binary PCD v0.7: the same points as in the PLY, with the names that PCL has.
+//! The surface of the map as a point cloud, binary PCD v0.7: the points of the PLY, with the field names of PCL.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -6,7 +6,7 @@ use std::path::Path;
 use crate::service::atomic_file::write_atomically;
 use crate::slam::fusion::SurfacePoint;
 
-/// What the file begins with.
+/// Beginning of the file.
 pub const BEGINNING: &str = "# .PCD v0.7 - x y z in map units";
 
 /// Writes the surface of the map.
@@ -31,7 +31,7 @@ pub fn write_pcd(path: &Path, surface: &[SurfacePoint]) -> io::Result<()> {
             for number in point.position.iter().chain(&point.normal) {
                 file.write_all(&number.to_le_bytes())?;
             }
-            // PCL keeps blue, green and red in the bytes of a number.
+            // PCL packs blue, green and red into the bytes of a number.
             file.write_all(&[point.grey, point.grey, point.grey, 0])?;
             file.write_all(&point.sigma.to_le_bytes())?;
             file.write_all(&[point.keyframes])

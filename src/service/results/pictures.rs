@@ -4,10 +4,10 @@ use crate::service::results::colour::{Picture, Rgb, heat, rainbow};
 use crate::slam::evaluation::statistics::percentiles;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
 
-/// Brightness of the image under a depth map: dark enough that colours stand out.
+/// Brightness of the image behind a depth map: dark enough for colours to stand out.
 const BACKGROUND_GAIN: f64 = 0.45;
 
-/// Share of the points at either end of the scale that it does not stretch to: outliers.
+/// Share of the points at either end that the scale leaves out: outliers.
 const CLIPPED_SHARE: f64 = 0.02;
 
 /// σ/d at the lower and upper end of the variance scale, which is logarithmic.
@@ -16,8 +16,8 @@ pub const RELATIVE_STD_DEV_RANGE: [f64; 2] = [0.003, 0.3];
 /// Side of the blocks whose density is shown, pixels.
 const DENSITY_BLOCK: usize = 16;
 
-/// Inverse depth in colour (red near, blue far) over the darkened image, with what the ends of the
-/// scale mean. Points with σ/d above `max_relative_std_dev` are left out.
+/// Inverse depth in colour (red near, blue far) over the darkened image, with the values at the ends of the scale.
+/// Points with σ/d above `max_relative_std_dev` are left out.
 pub fn inverse_depth_picture(
     keyframe: &Keyframe,
     max_relative_std_dev: f64,
@@ -35,7 +35,7 @@ pub fn inverse_depth_picture(
     (picture, Some([far, near]))
 }
 
-/// Lower and upper end of the values without the outliers at either end; `None` of none.
+/// Lower and upper end of the values without the outliers at either end; `None` where there are no values.
 pub fn middle_range(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
     percentiles(values, [CLIPPED_SHARE, 1.0 - CLIPPED_SHARE])
 }
@@ -51,7 +51,7 @@ pub fn variance_picture(keyframe: &Keyframe) -> Picture {
     picture
 }
 
-/// Share of pixels with depth by block.
+/// Share of pixels with depth, per block.
 pub fn density_picture(keyframe: &Keyframe) -> Picture {
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
     let columns = width.div_ceil(DENSITY_BLOCK);

@@ -9,10 +9,10 @@ use crate::slam::fusion::SurfacePoint;
 
 /// Bytes of a point of the surface in the file.
 pub const SURFACE_POINT_BYTES: usize = 32;
-/// What each begins with.
+/// Beginning of each file.
 pub const BEGINNING: &str =
     "ply\nformat binary_little_endian 1.0\ncomment x y z in map units, sigma";
-/// The properties of a point, in their order.
+/// The properties of a point, in order.
 const PROPERTIES: &str = "property float x\nproperty float y\nproperty float z\n\
      property float nx\nproperty float ny\nproperty float nz\n\
      property uchar red\nproperty uchar green\nproperty uchar blue\n\
@@ -41,15 +41,15 @@ pub enum ReadSurfaceError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
-    /// It is another file.
+    /// It is not a `map.ply` of this version.
     #[error("{0} is not a map.ply of this version of semidense: write it again")]
     Foreign(PathBuf),
 }
 
-/// The first points of a `map.ply`, at most `most` of them: they show all of the map, coarser the fewer they are. Points
+/// Reads the first points of a `map.ply`, at most `most`: they show the whole map, coarser the fewer they are. Points
 /// that are not finite are left out.
 pub fn read_surface(path: &Path, most: usize) -> Result<Vec<SurfacePoint>, ReadSurfaceError> {
     let failed = |source| ReadSurfaceError::Read { path: path.to_owned(), source };
@@ -65,9 +65,9 @@ pub fn read_surface(path: &Path, most: usize) -> Result<Vec<SurfacePoint>, ReadS
     Ok(points)
 }
 
-/// How many points follow; `None` of another file.
+/// The number of points that follow; `None` for another file.
 fn read_header(file: &mut impl BufRead) -> io::Result<Option<usize>> {
-    /// No header of ours is longer.
+    /// Longer than any header written here.
     const LONGEST: usize = 1000;
     const END: &[u8] = b"\nend_header\n";
     let mut header = Vec::new();
@@ -112,7 +112,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_surface_is_read_as_it_was_written_and_a_short_or_foreign_file_is_refused() {
+    fn a_surface_is_read_back_and_a_short_or_foreign_file_is_refused() {
         let point = |i: u8| SurfacePoint {
             position: [f32::from(i), 0.5, -1.25],
             normal: [0.0, f32::from(i % 2), 0.0],

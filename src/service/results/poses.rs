@@ -24,8 +24,8 @@ pub const FINAL_COMMENT: &str =
 /// First line of `trajectory_online.txt`.
 pub const ONLINE_COMMENT: &str = "world_from_camera of every tracked frame as it was published";
 
-/// The epoch with the most tracked frames, the earliest of equals; `None` where none is tracked. Each
-/// epoch has a frame and a scale of its own, so that only one can be compared with ground truth.
+/// The epoch with the most tracked frames, the earliest of equals; `None` where none is tracked. Each epoch has a
+/// separate coordinate frame and scale, so that only one can be compared with ground truth.
 pub fn longest_epoch(record: &RunRecord) -> Option<u32> {
     most_frequent(tracked(record).map(|estimate| final_epoch(record, estimate)))
 }
@@ -39,9 +39,9 @@ fn most_frequent(epochs: impl Iterator<Item = u32>) -> Option<u32> {
     frames.into_iter().rev().max_by_key(|&(_, count)| count).map(|(epoch, _)| epoch)
 }
 
-/// Every frame with a pose, on the final place of its keyframe, in the map, with the epoch that it belongs to in the end:
-/// frames that were tracked, and those that came before their map began and were aligned to it afterwards. A tracked frame
-/// whose keyframe the final map does not hold keeps its published place. None where no frame was tracked when it came: a
+/// Every frame with a pose, at the final pose of its keyframe in the map, with the epoch that it belongs to in the end:
+/// tracked frames, and frames from before the start of their map that were aligned to it afterwards. A tracked frame
+/// whose keyframe the final map does not hold keeps its published pose. Empty where no frame was tracked on arrival: a
 /// map that began with the last frames is unproven.
 pub fn final_poses(record: &RunRecord) -> Vec<EpochPose> {
     if !is_any_tracked(&record.poses) {
@@ -66,12 +66,12 @@ pub fn final_poses(record: &RunRecord) -> Vec<EpochPose> {
     with_pose.collect()
 }
 
-/// The poses of one epoch; none of no epoch.
+/// The poses of one epoch; empty for `None`.
 pub fn of_epoch(poses: &[EpochPose], epoch: Option<u32>) -> Vec<StampedPose> {
     poses.iter().filter(|of| Some(of.epoch) == epoch).map(|of| of.pose).collect()
 }
 
-/// Frames that came before their map began and were aligned to it afterwards.
+/// Frames from before the start of their map that were aligned to it afterwards.
 pub fn placed_later<'a>(
     poses: &'a [RecordedPose],
     map: &'a Map,
@@ -91,8 +91,8 @@ fn final_epoch(record: &RunRecord, estimate: &PoseEstimate) -> u32 {
     record.map.get(estimate.keyframe_id).map_or(estimate.epoch, |keyframe| keyframe.epoch)
 }
 
-/// Tracked frames of one epoch as they were published. Where other epochs were joined to it, each had a world of its own,
-/// in which odometry stayed: the frames of the world that has most of them.
+/// Tracked frames of one epoch as published. Where other epochs were joined to it, each had a separate world, in which
+/// odometry stayed: the frames of the world with the most of them.
 pub fn online_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPose> {
     let is_of_epoch = tracked(record).map(|of| Some(final_epoch(record, of)) == epoch);
     let with_world = online_poses(record).into_iter().zip(is_of_epoch);
@@ -100,10 +100,10 @@ pub fn online_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedP
     of_epoch(&poses, most_frequent(poses.iter().map(|of| of.epoch)))
 }
 
-/// Every tracked frame as it was published, with the epoch that its world began with.
+/// Every tracked frame as published, with the epoch that its world began with.
 pub fn online_poses(record: &RunRecord) -> Vec<EpochPose> {
     let with_epoch = tracked(record).scan(0, |newest, estimate| {
-        // Where an epoch is joined to an older one, or an older one is taken up again, odometry stays where it is.
+        // Where an epoch is joined to an older one, or an older one is resumed, odometry does not jump.
         *newest = estimate.epoch.max(*newest);
         Some(EpochPose { epoch: *newest, pose: in_world(estimate) })
     });
@@ -118,8 +118,8 @@ fn in_world(estimate: &PoseEstimate) -> StampedPose {
     StampedPose { nanos: estimate.capture_nanos, world_from_camera: estimate.world_from_camera }
 }
 
-/// Errors of the tracked frames of one epoch against their covariance, on their keyframes, in the map and of their
-/// velocities; `None` without ground truth or where it was given.
+/// Errors of the tracked frames of one epoch relative to their covariance: on their keyframes, in the map and of their
+/// velocities; `None` without ground truth, or where poses were given.
 pub fn normalized_errors_of(
     record: &RunRecord,
     epoch: Option<u32>,
@@ -133,7 +133,7 @@ pub fn normalized_errors_of(
     let keyframes = record.map.keyframes.iter().filter(|keyframe| in_epoch(keyframe.epoch));
     let stamps: Vec<(u64, i64)> = keyframes.map(|k| (k.keyframe_id, k.capture_nanos)).collect();
     let truth = &record.ground_truth;
-    // Before its epoch was joined to this one a frame was placed in another map.
+    // Before its epoch was joined to this one, a frame was placed in another map.
     let in_map: Vec<&PoseEstimate> =
         tracked.iter().copied().filter(|estimate| in_epoch(estimate.epoch)).collect();
     [
@@ -143,7 +143,7 @@ pub fn normalized_errors_of(
     ]
 }
 
-/// Writes one line for each keyframe: its pose as in a TUM file, then what a map needs besides.
+/// Writes one line per keyframe: its pose as in a TUM file, then what a map needs besides.
 pub fn write_keyframes(path: &Path, map: &Map) -> io::Result<()> {
     write_atomically(path, |file| {
         writeln!(file, "# map_from_keyframe; lengths in the keyframe x scale = map units")?;

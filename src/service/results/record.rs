@@ -1,4 +1,4 @@
-//! What is known of a run when it ends.
+//! The record of a run at its end.
 
 use std::collections::BTreeMap;
 use std::time::SystemTime;
@@ -29,22 +29,22 @@ pub enum RunMode {
     Live,
 }
 
-/// A pose as the tracker gave it, with what it cost.
+/// A pose as the tracker produced it, with its cost.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RecordedPose {
     /// The tracking result.
     pub estimate: PoseEstimate,
-    /// From the frame's stamp to the publication; `None` where stamps are of another clock.
+    /// From the frame's stamp to the publication; `None` where stamps use another clock.
     pub latency_nanos: Option<u64>,
     /// Time in the tracker; `None` where the pose was given.
     pub track_nanos: Option<u64>,
-    /// What its parts took; `None` where the frame was not aligned in this process.
+    /// Times of its parts; `None` where the frame was not aligned in this process.
     pub trace: Option<AlignmentTrace>,
-    /// From the frame's sending to the tracker's look at it; `None` in one process.
+    /// From the frame's sending to its pick-up by the tracker; `None` in one process.
     pub wake_nanos: Option<u64>,
 }
 
-/// What frames came to while there was no map, counted.
+/// Counts of the outcomes of frames while there was no map.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct StartTally(pub BTreeMap<StartFrame, u64>);
 
@@ -57,111 +57,111 @@ impl StartTally {
     }
 }
 
-/// The map was found to contradict itself.
+/// A contradiction found in the map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Rejection {
-    /// Sequence of the frame that showed it.
+    /// Sequence of the frame that revealed it.
     pub sequence: u64,
-    /// How.
+    /// The contradiction.
     pub contradiction: Contradiction,
 }
 
 /// How a run ended.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum EndOfRun {
-    /// With the end of the source.
+    /// At the end of the source.
     #[default]
     Finished,
     /// By a signal.
     Interrupted,
-    /// Because something failed; says what.
+    /// Because of this failure.
     Failed(String),
-    /// It was killed at about this time: this is what its journal has of it.
+    /// It was killed at about this time: these are the contents of its journal.
     Recovered(SystemTime),
 }
 
-/// Why a process was started again, and how often for this.
+/// Why a process was restarted, and how often for this reason.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RestartCause {
     /// The process.
     pub process: String,
-    /// What had ended it, in one line.
+    /// What ended it, in one line.
     pub cause: String,
     /// How often.
     pub count: u64,
 }
 
-/// Everything that is known of a run when it ends.
+/// Everything that is recorded of a run.
 #[derive(Debug, Clone, Default)]
 pub struct RunRecord {
     /// How it was driven.
     pub mode: RunMode,
-    /// Where the frames came from, as the user named it.
+    /// Source of the frames, as the user named it.
     pub source: String,
     /// How it ended.
     pub ended: EndOfRun,
-    /// One for each frame that reached the tracker, in order.
+    /// One per frame that reached the tracker, in order.
     pub poses: Vec<RecordedPose>,
     /// The map at the end.
     pub map: Map,
     /// True poses in order of their stamps, empty where there are none.
     pub ground_truth: Vec<StampedPose>,
-    /// Where metres come from when depth is compared.
+    /// Source of the metric scale when depth is compared.
     pub depth_scale: DepthScale,
-    /// Whether keyframes took their first depth from the source's depth camera: held against that camera, it
-    /// tells nothing.
+    /// Whether keyframes took their first depth from the source's depth camera: a comparison with that camera then
+    /// shows nothing.
     pub is_depth_from_sensor: bool,
-    /// Frames that the source gave.
+    /// Frames that the source delivered.
     pub frames_in: u64,
     /// Images of the source that could not be used and were left out.
     pub frames_refused: u64,
-    /// Which of them was the first, and why.
+    /// The first of them, and why.
     pub refused: Option<String>,
-    /// Frames that the tracker never saw because a newer one had come.
+    /// Frames that the tracker never saw because a newer one had arrived.
     pub frames_dropped: u64,
-    /// Places where the source's sequence has a hole.
+    /// Gaps in the source's sequence.
     pub gaps: u64,
-    /// Processes that were started again.
+    /// Processes that were restarted.
     pub restarts: u64,
-    /// Which, and why; empty in one process.
+    /// Which processes, and why; empty in one process.
     pub restart_causes: Vec<RestartCause>,
-    /// Frames with a pose that the mapper did not take in because newer ones had come; `None` in one process.
+    /// Frames with a pose that the mapper skipped because newer ones had arrived; `None` in one process.
     pub frames_skipped_by_mapper: Option<u64>,
-    /// Time that the tracker was allowed for a frame; `None` without a deadline.
+    /// Time allowed to the tracker for a frame; `None` without a deadline.
     pub deadline_nanos: Option<u64>,
     /// Frames published after the deadline; `None` without one.
     pub deadline_misses: Option<u64>,
-    /// How late capture sent frames after their stamp; `None` but of live runs.
+    /// How long after their stamp capture sent frames; `None` except for live runs.
     pub send_counts: Option<TimeCounts>,
     /// Page faults of the tracker's frame loop since it was warm; `None` in one process.
     pub page_faults: Option<u64>,
-    /// Time in the mapper, one for each frame it handled.
+    /// Time in the mapper, one per frame it mapped.
     pub map_nanos: Vec<u64>,
-    /// Of them, those of the steps that changed to a new keyframe.
+    /// Those of the steps that changed to a new keyframe.
     pub keyframe_step_nanos: Vec<u64>,
-    /// Of each of those, the time from the observed frame to a keyframe that others can have: carrying,
+    /// For each of those, the time from the observed frame to a keyframe that other processes can use: propagating,
     /// smoothing, live also publishing.
     pub keyframe_nanos: Vec<u64>,
     /// Joint estimates of keyframes, in the order of their entry.
     pub adjustments: Vec<AdjustmentRecord>,
-    /// Searches for places that were seen before; `None` where they are not told of.
+    /// Searches for places that were seen before; `None` where they are not reported.
     pub searches: Option<Vec<SearchRecord>>,
-    /// What frames came to while there was no map.
+    /// Outcomes of frames while there was no map.
     pub start: StartTally,
-    /// Frames at which the map was found to contradict itself, and how; known in a replay.
+    /// Frames at which the map was found to contradict itself, and how; replay only.
     pub rejections: Option<Vec<Rejection>>,
-    /// Frames that were aligned again with fewer iterations; empty where none were.
+    /// Frames realigned with fewer iterations; empty where none were.
     pub budget_samples: Vec<BudgetSample>,
-    /// First to last stamp.
+    /// From the first to the last stamp.
     pub recorded_nanos: u64,
-    /// Time that the run took, without the preparation of the source and frames aligned again.
+    /// Duration of the run, without the preparation of the source and the realigned frames.
     pub wall_nanos: u64,
     /// Largest resident memory of all processes together.
     pub peak_rss_bytes: Option<u64>,
 }
 
 impl RunRecord {
-    /// Of a run that has not begun.
+    /// The record of a run that has not begun.
     pub fn empty(mode: RunMode, source: &str) -> Self {
         Self { mode, source: source.to_owned(), ..Self::default() }
     }

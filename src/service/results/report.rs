@@ -1,4 +1,4 @@
-//! `report.html`: a run on one page that needs no other file and no network.
+//! `report.html`: a run on one page, which needs no other file and no network.
 
 pub(crate) mod axis;
 pub(crate) mod budget_charts;
@@ -56,7 +56,7 @@ use crate::slam::up::up_direction;
 /// Keyframes whose depth is shown: enough to see the run, few enough for one page.
 const PICTURED_KEYFRAMES: usize = 8;
 
-/// The page.
+/// Renders the page.
 pub fn report(results: &Results<'_>) -> String {
     let summary = &results.summary;
     let mode = match summary.mode {
@@ -100,7 +100,7 @@ pub fn report(results: &Results<'_>) -> String {
     page
 }
 
-/// What a reader must know first: that a run did not come to its end, or tracked nothing.
+/// What a reader must know first: that a run did not finish, or tracked nothing.
 fn notices(summary: &Summary, ended: &EndOfRun) -> String {
     let end = match ended {
         EndOfRun::Finished => None,
@@ -120,7 +120,7 @@ fn notices(summary: &Summary, ended: &EndOfRun) -> String {
     end.into_iter().chain(untracked).map(notice).collect()
 }
 
-/// What a deadline costs; nothing where no frame was aligned again.
+/// Cost of a deadline; empty where no frame was realigned.
 fn budget(results: &Results<'_>) -> String {
     let samples = &results.record.budget_samples;
     let intro = format!(
@@ -133,7 +133,7 @@ fn budget(results: &Results<'_>) -> String {
     section("Quality and budget", &intro, &charts)
 }
 
-/// Charts side by side under a heading and what `intro` says; nothing where there are none.
+/// Charts side by side below a heading and `intro`; empty where there are none.
 fn section(heading: &str, intro: &str, charts: &[Chart]) -> String {
     if charts.is_empty() {
         return String::new();
@@ -142,7 +142,7 @@ fn section(heading: &str, intro: &str, charts: &[Chart]) -> String {
     format!("<section><h2>{heading}</h2>{intro}<div class=\"charts\">{figures}</div></section>")
 }
 
-/// The figures that matter most, large.
+/// The most important figures, large.
 fn cards(summary: &Summary) -> String {
     let mut cards = String::from("<section class=\"cards\">");
     let mut card = |name: &str, value: String, note: String| {
@@ -197,7 +197,7 @@ fn cards(summary: &Summary) -> String {
     cards
 }
 
-/// Name and share of each state, and a strip that shows when it was.
+/// Name and share of each state, and a strip that shows when it occurred.
 fn states(record: &RunRecord) -> String {
     let count = record.poses.len();
     if count == 0 {
@@ -279,7 +279,7 @@ fn depth_maps(results: &Results<'_>) -> String {
     html
 }
 
-/// The picture as part of the page; nothing where it cannot be encoded.
+/// The picture as part of the page; empty where it cannot be encoded.
 fn picture_figure(picture: &Picture, keyframe: &Keyframe, note: &str) -> String {
     let Some(png) = picture.png() else { return String::new() };
     format!(

@@ -8,29 +8,29 @@ use crate::capture::source_error::SourceError;
 /// Why results cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub enum ResultsError {
-    /// A file or folder that cannot be written.
+    /// A file or folder cannot be written.
     #[error("cannot write {path}: {source}; choose another folder with --output")]
     Write {
         /// The file or folder.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
-    /// There is no room.
+    /// There is not enough space.
     #[error(
         "cannot write {path}: {source}; about {needed_mb} MB are needed and {free_mb} MB are free: make room, or choose another folder with --output"
     )]
     Room {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
-        /// What all files of the run take.
+        /// Space for all files of the run.
         needed_mb: u64,
-        /// What the file system has.
+        /// Free space of the file system.
         free_mb: u64,
     },
-    /// A file of the user's would be replaced.
+    /// A file of the user would be replaced.
     #[error(
         "{0} was not written by semidense and would be replaced: move it away, or choose another folder with --output"
     )]
@@ -45,7 +45,7 @@ pub enum ResultsError {
         /// Id of the process.
         process: String,
     },
-    /// True depth that cannot be read.
+    /// True depth cannot be read.
     #[error("cannot read the depth of a keyframe for evaluation: {0}")]
     Depth(#[from] SourceError),
 }

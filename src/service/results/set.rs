@@ -1,9 +1,9 @@
-//! The files of a run as one set: written aside, then put in the place of the set before, all or none.
+//! The files of a run as one set: written aside, then put in the place of the previous set, all or none.
 //!
-//! A set is written into a folder of its own inside the output folder, synchronised, and renamed to a name that
-//! says that it is complete. From then on its files only have to be moved up: whoever finds a complete set
-//! (see [`finish_commit`]) continues with that, so that two sets are never mixed. Only files that a run writes are
-//! ever replaced or removed.
+//! A set is written into a separate folder inside the output folder, synchronised, and renamed to a name that marks it
+//! as complete. From then on its files only have to be moved up: a process that finds a complete set (see
+//! [`finish_commit`]) continues with that, so that two sets are never mixed. Only files that a run writes are ever
+//! replaced or removed.
 
 use std::fs::{self, File};
 use std::io::{self, Read};
@@ -14,7 +14,7 @@ use rustix::fs::FlockOperation;
 
 use crate::service::results::{full_points, pcd};
 
-/// Files of every set, with what each begins with: a file of that name that begins otherwise is the user's.
+/// Files of every set, with their beginnings: a file of that name that begins otherwise is the user's.
 const FILES: [(&str, &str); 7] = [
     ("summary.json", "{\n  \"mode\": \""),
     ("trajectory.txt", "# map_from_camera of every tracked frame"),
@@ -24,37 +24,37 @@ const FILES: [(&str, &str); 7] = [
     ("points.ply", "ply\nformat binary_little_endian 1.0\ncomment points of the joint estimation"),
     ("report.html", "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">"),
 ];
-/// Files of sets for which they were asked, likewise.
+/// Files of sets on request, likewise.
 const ON_REQUEST: [(&str, &str); 2] =
     [("map.pcd", pcd::BEGINNING), ("points-full.ply", full_points::BEGINNING)];
-/// How files of earlier versions begin: they are ours too.
+/// Beginnings of the files of earlier versions, which count as ours too.
 const EARLIER: [(&str, &str); 2] = [
     ("trajectory.txt", "# world_from_camera of every tracked frame"),
     ("keyframes.txt", "# world_from_keyframe; lengths in the keyframe"),
 ];
-/// The file that is moved up first: as long as it is still aside, the files of the set before are in place.
+/// The file that is moved up first: while it is still aside, the files of the previous set are in place.
 const FIRST: &str = FILES[0].0;
-/// Folder of pictures for whoever works on the algorithms, in sets that have them.
+/// Folder of pictures for work on the algorithms, in sets that have them.
 pub const DEBUG_FOLDER: &str = "debug";
 
-/// Name of a set that is being written, before the process id.
+/// Name of a set that is being written, followed by the process id.
 const PARTIAL: &str = ".semidense-results.partial-";
-/// Name of a set that is written and not yet moved up.
+/// Name of a set that is complete and not yet moved up.
 const COMPLETE: &str = ".semidense-results.complete";
 
-/// A set that is being written. Dropped without a commit it is removed, and the set before stays.
+/// A set that is being written. Removed when dropped without a commit, and the previous set stays.
 #[derive(Debug)]
 pub struct ResultSet {
     output: PathBuf,
     folder: PathBuf,
-    /// Held while the set is written: a folder that nobody holds was left by a process that died.
+    /// Held while the set is written: a folder that no process holds was left by one that died.
     _lock: File,
 }
 
 impl ResultSet {
-    /// Begins a set inside the folder `output`; what killed processes left half written there goes.
+    /// Begins a set inside the folder `output`, and removes what killed processes left half written there.
     pub fn begin(output: &Path) -> io::Result<Self> {
-        // Nobody else clears up between the making of the folder and its being held.
+        // No other process clears up between the creation of the folder and its lock.
         let _alone = lock(output)?;
         remove_abandoned(output)?;
         let folder = output.join(format!("{PARTIAL}{}", std::process::id()));
@@ -64,12 +64,12 @@ impl ResultSet {
         Ok(Self { output: output.to_owned(), folder, _lock: lock })
     }
 
-    /// Where its files are written.
+    /// The folder for its files.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Puts the set in the place of the one before.
+    /// Puts the set in the place of the previous one.
     pub fn commit(self) -> io::Result<()> {
         synchronise(&self.folder)?;
         let output = lock(&self.output)?;
@@ -82,12 +82,12 @@ impl ResultSet {
 
 impl Drop for ResultSet {
     fn drop(&mut self) {
-        // What cannot be removed is removed by the next set. After a commit there is nothing.
+        // What cannot be removed is left to the next set. After a commit there is nothing to remove.
         drop(fs::remove_dir_all(&self.folder));
     }
 }
 
-/// Moves up a complete set that a killed process has left in `output`; whether there was one.
+/// Moves up a complete set that a killed process left in `output`; returns whether there was one.
 pub fn finish_commit(output: &Path) -> io::Result<bool> {
     if !output.join(COMPLETE).exists() {
         return Ok(false);
@@ -97,7 +97,7 @@ pub fn finish_commit(output: &Path) -> io::Result<bool> {
     Ok(true)
 }
 
-/// The first file in `output` that a set would replace and that no run has written.
+/// The first file in `output` that a set would replace and that no run wrote.
 pub fn foreign_file(output: &Path) -> io::Result<Option<PathBuf>> {
     for (name, beginning) in FILES.into_iter().chain(ON_REQUEST) {
         let path = output.join(name);
@@ -111,7 +111,7 @@ pub fn foreign_file(output: &Path) -> io::Result<Option<PathBuf>> {
     Ok(None)
 }
 
-/// What stands in `output` where a folder of pictures would be and is none: the user's.
+/// A file of the user in `output` in the place of the folder of pictures.
 pub fn foreign_debug(output: &Path) -> Option<PathBuf> {
     let debug = output.join(DEBUG_FOLDER);
     (fs::symlink_metadata(&debug).is_ok() && !debug.is_dir()).then_some(debug)
@@ -123,7 +123,7 @@ pub fn has_set(output: &Path) -> bool {
     begins_with(&output.join(name), beginning).unwrap_or(false)
 }
 
-/// Whether `output` holds a set of a run that has tracked something.
+/// Whether `output` holds a set of a run with tracked frames.
 pub fn has_tracked_set(output: &Path) -> bool {
     let tracked = || {
         let text = fs::read_to_string(output.join(FILES[0].0)).ok()?;
@@ -154,14 +154,14 @@ fn begins_with(path: &Path, beginning: &str) -> io::Result<bool> {
     Ok(bytes == beginning.as_bytes())
 }
 
-/// Keeps other processes from moving a set up in the same folder. Ends when dropped.
+/// Keeps other processes from moving a set up in the same folder, until it is dropped.
 fn lock(output: &Path) -> io::Result<File> {
     let folder = File::open(output)?;
     rustix::fs::flock(&folder, FlockOperation::LockExclusive)?;
     Ok(folder)
 }
 
-/// Moves the files of a complete set up, where there is one. Can be interrupted anywhere and repeated.
+/// Moves the files of a complete set up, if there is one. Can be interrupted anywhere and repeated.
 fn move_up(output: &Path) -> io::Result<()> {
     let complete = output.join(COMPLETE);
     if !complete.exists() {
@@ -181,7 +181,7 @@ fn move_up(output: &Path) -> io::Result<()> {
                 move_files(&debug, &output.join(DEBUG_FOLDER))?;
                 fs::remove_dir(debug)?;
             }
-            // It came during the run. The results are worth more than the pictures.
+            // It appeared during the run. The results are worth more than the pictures.
             Some(file) => {
                 tracing::warn!("{}: no folder, so that no pictures are written", file.display());
                 fs::remove_dir_all(debug)?;
@@ -202,7 +202,7 @@ fn move_files(from: &Path, to: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Removes the pictures of the set before: the new one need not have as many.
+/// Removes the pictures of the previous set: the new one may have fewer.
 fn remove_debug_pictures(output: &Path) -> io::Result<()> {
     let debug = output.join(DEBUG_FOLDER);
     if !has_set(output) || !debug.is_dir() {
@@ -214,12 +214,12 @@ fn remove_debug_pictures(output: &Path) -> io::Result<()> {
             fs::remove_file(entry.path())?;
         }
     }
-    // A folder that holds something of the user's stays.
+    // A folder with a file of the user stays.
     drop(fs::remove_dir(debug));
     Ok(())
 }
 
-/// Removes what the set before had on request: the new one need not have it.
+/// Removes the files that the previous set had on request: the new one may lack them.
 fn remove_on_request(output: &Path) -> io::Result<()> {
     for (name, beginning) in ON_REQUEST {
         let path = output.join(name);
@@ -230,7 +230,7 @@ fn remove_on_request(output: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Whether a file has the name of a picture of a keyframe: `keyframe-NNNN-kind.png`.
+/// Whether a file is named like a picture of a keyframe: `keyframe-NNNN-kind.png`.
 fn is_debug_picture(name: &str) -> bool {
     let kinds = ["inverse-depth", "variance", "density", "weights"];
     let rest = name.strip_prefix("keyframe-").and_then(|rest| rest.strip_suffix(".png"));
@@ -239,7 +239,7 @@ fn is_debug_picture(name: &str) -> bool {
     })
 }
 
-/// Removes sets that processes were writing when they died. While the folder is locked.
+/// Removes sets that processes were writing when they died. Call while the folder is locked.
 fn remove_abandoned(output: &Path) -> io::Result<()> {
     for entry in fs::read_dir(output)? {
         let path = entry?.path();
@@ -250,7 +250,7 @@ fn remove_abandoned(output: &Path) -> io::Result<()> {
         let Ok(folder) = File::open(&path) else { continue };
         if rustix::fs::flock(&folder, FlockOperation::NonBlockingLockExclusive).is_ok()
             && let Err(error) = fs::remove_dir_all(&path)
-            // Its writer has removed it just now.
+            // Its writer has just removed it.
             && error.kind() != io::ErrorKind::NotFound
         {
             return Err(error);
@@ -259,7 +259,7 @@ fn remove_abandoned(output: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Waits until every file of `folder` and the folder itself are on the disk.
+/// Syncs every file of `folder`, and the folder itself, to disk.
 fn synchronise(folder: &Path) -> io::Result<()> {
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
@@ -275,12 +275,12 @@ fn synchronise(folder: &Path) -> io::Result<()> {
 mod tests {
     use super::*;
 
-    /// Writes a set whose files all end in `text`, with so many pictures.
+    /// Writes a set whose files all end in `text`, with this many pictures.
     fn write(set: &ResultSet, text: &str, pictures: usize) {
         for (name, beginning) in FILES {
             fs::write(set.folder().join(name), format!("{beginning}{text}")).unwrap();
         }
-        // Whoever asks for pictures asks for the other files too.
+        // A set with pictures also has the other files on request.
         for (name, beginning) in ON_REQUEST.into_iter().filter(|_| pictures > 0) {
             fs::write(set.folder().join(name), format!("{beginning}{text}")).unwrap();
         }
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn a_set_replaces_the_one_before_and_nothing_else() {
+    fn a_set_replaces_the_previous_one_and_nothing_else() {
         let folder = tempfile::tempdir().unwrap();
         let output = folder.path();
         for (name, text) in [("notes.txt", "mine"), ("debug.txt", "mine")] {
@@ -348,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn a_set_that_is_given_up_leaves_the_one_before() {
+    fn an_abandoned_set_leaves_the_previous_one() {
         let folder = tempfile::tempdir().unwrap();
         commit(folder.path(), "first", 1);
         let before = content(folder.path());
@@ -359,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn a_commit_that_is_interrupted_anywhere_is_finished_by_the_next() {
+    fn a_commit_interrupted_anywhere_is_completed_by_the_next() {
         for moved in 0..FILES.len() {
             let folder = tempfile::tempdir().unwrap();
             let output = folder.path();
@@ -368,7 +368,7 @@ mod tests {
             write(&set, "second", 1);
             fs::rename(set.folder(), output.join(COMPLETE)).unwrap();
             drop(set);
-            // The process dies when it has moved so many files.
+            // The process dies after it has moved this many files.
             if moved > 0 {
                 remove_debug_pictures(output).unwrap();
                 remove_on_request(output).unwrap();
@@ -385,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_killed_process_was_writing_goes_and_what_another_writes_stays() {
+    fn a_set_of_a_killed_process_is_removed_and_one_being_written_stays() {
         let folder = tempfile::tempdir().unwrap();
         let abandoned = folder.path().join(format!("{PARTIAL}4194304"));
         fs::create_dir(&abandoned).unwrap();
@@ -399,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_of_the_user_in_the_place_of_the_pictures_survives() {
+    fn a_user_file_in_place_of_the_pictures_survives() {
         let folder = tempfile::tempdir().unwrap();
         let output = folder.path();
         assert_eq!(foreign_debug(output), None);
@@ -414,12 +414,12 @@ mod tests {
     }
 
     #[test]
-    fn sets_that_begin_side_by_side_do_not_take_each_others_folder() {
+    fn concurrent_sets_do_not_take_each_others_folder() {
         let folder = tempfile::tempdir().unwrap();
         let output = folder.path();
         let is_over = std::sync::atomic::AtomicBool::new(false);
         std::thread::scope(|scope| {
-            // As other processes do when they begin a set of their own.
+            // As other processes do when they begin their own sets.
             let clearing = scope.spawn(|| {
                 while !is_over.load(std::sync::atomic::Ordering::Relaxed) {
                     let _alone = lock(output).unwrap();
@@ -438,7 +438,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_of_the_user_is_found_and_one_of_ours_is_none() {
+    fn only_a_user_file_counts_as_foreign() {
         let folder = tempfile::tempdir().unwrap();
         assert!(foreign_file(folder.path()).unwrap().is_none() && !has_set(folder.path()));
         commit(folder.path(), "first", 0);

@@ -6,22 +6,21 @@ use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::record::RunRecord;
 use crate::service::results::times::{Percentiles, track_nanos};
 
-/// What the steps of a frame took.
+/// Times of the steps of a frame.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StepTimes {
     /// Time in the tracker for a frame.
     pub track_ms: Option<Percentiles>,
-    /// Of it, from the frame to the first iteration: the image pyramid, but for some thousandths.
-    /// Known in a replay.
+    /// The part from the frame to the first iteration: the image pyramid, apart from a few microseconds. Replay only.
     pub pyramid_ms: Option<Percentiles>,
-    /// What aligning costs on each pyramid level, finest first. Known in a replay.
+    /// Cost of alignment on each pyramid level, finest first. Replay only.
     pub alignment_levels: Option<Vec<LevelSummary>>,
     /// Time in the mapper for a frame.
     pub map_ms: Option<Percentiles>,
-    /// Of it, the steps that changed to a new keyframe.
+    /// That of the steps that changed to a new keyframe.
     pub keyframe_step_ms: Option<Percentiles>,
-    /// Of those, from the observed frame to a keyframe that others can have: carrying, smoothing, live
-    /// also publishing. What follows, depth for new pixels, is published as its next revision.
+    /// The part of those from the observed frame to a keyframe that other processes can use: propagating, smoothing,
+    /// live also publishing. What follows, depth for new pixels, is published as its next revision.
     pub keyframe_ms: Option<Percentiles>,
 }
 

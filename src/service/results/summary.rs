@@ -1,4 +1,4 @@
-//! `summary.json`: the figures of a run. A key without meaning in a mode is null.
+//! `summary.json`: the figures of a run. A key that is not applicable in a mode is null.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -27,19 +27,19 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;
 use crate::slam::pose::TrackingState;
 
-/// How many points there are, and what it took to fuse them.
+/// Numbers of points, and the time to fuse them.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct PointCounts {
-    /// Points of all keyframes that are known well enough.
+    /// Points of all keyframes that are certain enough.
     pub points: usize,
-    /// Points of `map.ply`: the surface that they are fused to, of the evaluated epoch.
+    /// Points of `map.ply`: the surface that they are fused into, of the evaluated epoch.
     pub map_points: usize,
-    /// Time that it took to fuse them.
+    /// Time to fuse them.
     pub fusion_secs: f64,
 }
 
-/// A trajectory against ground truth; all null where there is none. Lengths in the ground truth's
-/// unit (metres), errors after the alignment.
+/// A trajectory against ground truth; all null without ground truth. Lengths in the ground truth's unit (metres),
+/// errors after the alignment.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct TrajectorySummary {
     /// Poses that have ground truth.
@@ -52,7 +52,7 @@ pub struct TrajectorySummary {
     pub ate_median_m: Option<f64>,
     /// Largest position error.
     pub ate_max_m: Option<f64>,
-    /// Factor that multiplies our lengths to give the truth's.
+    /// Factor from estimated lengths to true ones.
     pub ate_scale: Option<f64>,
     /// Root mean square translation error from frame to frame, metres.
     pub rpe_translation: Option<f64>,
@@ -66,7 +66,7 @@ pub struct TrajectorySummary {
     pub path_length_m: Option<f64>,
     /// Largest over smallest scale of consecutive windows of 100 frames.
     pub window_scale_ratio: Option<f64>,
-    /// Median position error of windows of 30 frames, each aligned by itself.
+    /// Median position error of windows of 30 frames, each aligned separately.
     pub window_error_m: Option<f64>,
 }
 
@@ -120,10 +120,10 @@ impl From<&NormalizedErrors> for NeesSummary {
     }
 }
 
-/// Depth of the keyframes against ground truth; all null where there is none.
+/// Depth of the keyframes against ground truth; all null without ground truth.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct DepthSummary {
-    /// Pixels of keyframes whose true depth is known.
+    /// Pixels of keyframes with known true depth.
     pub depth_pixels: Option<u64>,
     /// Median relative depth error over them.
     pub depth_relative_error_median: Option<f64>,
@@ -133,15 +133,15 @@ pub struct DepthSummary {
     pub depth_coverage: Option<[f64; 3]>,
     /// Share of the keyframes' pixels that have depth.
     pub depth_density: Option<f64>,
-    /// Depth errors common to a keyframe, medians of their magnitude: relative error for each unit of the ray
-    /// along columns, along rows, and for each unit of ln d (relief).
+    /// Depth errors common to a keyframe, medians of their magnitude: relative error per unit of the ray along columns,
+    /// along rows, and per unit of ln d (relief).
     pub depth_modes: Option<[f64; 3]>,
-    /// The same over the standard deviation that each keyframe claims: 0.67 is right, more is too sure.
+    /// The same over the standard deviation that each keyframe claims: 0.67 is right, more is overconfident.
     pub depth_modes_whitened: Option<[f64; 3]>,
-    /// Largest over smallest map unit of the keyframes, by their depth: 1 where the scale does not drift.
+    /// Largest over smallest map unit of the keyframes, according to their depth: 1 where the scale does not drift.
     #[serde(default)]
     pub depth_scale_ratio: Option<f64>,
-    /// The same and the modes keyframe by keyframe.
+    /// The same and the modes, per keyframe.
     #[serde(default)]
     pub keyframe_depth: Vec<KeyframeDepth>,
 }
@@ -167,16 +167,16 @@ impl From<DepthErrors> for DepthSummary {
 /// Frames by their state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct FrameCounts {
-    /// Frames with a pose: claimed when they came, or found afterwards.
+    /// Frames with a pose: claimed on arrival, or found afterwards.
     pub frames_tracked: u64,
-    /// Of them those that came before their map began and were aligned to it afterwards.
+    /// Those of them from before the start of their map, which were aligned to it afterwards.
     #[serde(default)]
     pub frames_tracked_later: u64,
-    /// Of them those whose pose is worse than it should be.
+    /// Those of them whose pose is worse than it should be.
     pub frames_degraded: u64,
-    /// Frames before the map could be trusted that have none.
+    /// Frames without a pose from before the map could be trusted.
     pub frames_initializing: u64,
-    /// Frames that have none because tracking was lost.
+    /// Frames without a pose because tracking was lost.
     pub frames_lost: u64,
 }
 
@@ -203,38 +203,38 @@ impl FrameCounts {
 pub struct Summary {
     /// How it was driven.
     pub mode: RunMode,
-    /// Where the frames came from.
+    /// Source of the frames.
     pub source: String,
-    /// The camera as its images came: rectified, pixels; null without a keyframe.
+    /// The camera of the rectified images, pixels; null without a keyframe.
     pub camera: Option<Intrinsics>,
-    /// How it ended: `finished`, `interrupted`, `failed`, or `recovered` where it was killed and this comes from
-    /// its journal.
+    /// How it ended: `finished`, `interrupted`, `failed`, or `recovered` where it was killed and this comes from its
+    /// journal.
     pub ended: String,
     /// What failed.
     pub failure: Option<String>,
-    /// When the run ended from whose journal this was recovered (UTC); null of any other run.
+    /// End (UTC) of the run from whose journal this was recovered; null for any other run.
     pub recovered_run_end: Option<String>,
-    /// Grade of the run by what can be known without ground truth.
+    /// Grade of the run from what is known without ground truth.
     pub grade: Grade,
-    /// Frames that the source gave.
+    /// Frames that the source delivered.
     pub frames_in: u64,
     /// Images of the source that could not be used and were left out.
     pub frames_refused: u64,
-    /// How many they are, which is the first, and what is wrong with it; null where there are none.
+    /// Their number, the first of them, and what is wrong with it; null where there are none.
     pub refused: Option<String>,
     /// Frames by their state.
     #[serde(flatten)]
     pub frames: FrameCounts,
     /// Frames that the tracker never saw.
     pub frames_dropped: u64,
-    /// Holes in the source's sequence.
+    /// Gaps in the source's sequence.
     pub gaps: u64,
     /// How often tracking was lost.
     pub lost_count: u64,
-    /// Each time the map was found to contradict itself: the frame, and why. Known in a replay.
+    /// Each time the map was found to contradict itself: the frame, and why. Replay only.
     pub map_rejections: Option<Vec<RejectionSummary>>,
-    /// Median over the tracked frames of residuals over their standard deviation: 1 where all is as modelled, above
-    /// 1.4 the calibration is doubted; null of less than 30 frames.
+    /// Median over the tracked frames of residuals over their standard deviation: 1 where everything is as modelled,
+    /// above 1.4 the calibration is doubted; null for fewer than 30 frames.
     pub whitened_residual_median: Option<f64>,
     /// From the first frame to the first whose pose is claimed; null where none is.
     pub initialization_secs: Option<f64>,
@@ -242,36 +242,36 @@ pub struct Summary {
     pub untracked: Option<String>,
     /// Keyframes of the final map.
     pub keyframes: u64,
-    /// Of them those whose depth is not held: the oldest of a long run, or what a recovery could not find.
+    /// Those of them without depth: the oldest of a long run, or those that a recovery could not find.
     pub keyframes_without_depth: u64,
     /// Their points, and those of `map.ply`.
     #[serde(flatten)]
     pub point_counts: PointCounts,
-    /// Life of the map at the end, from 0.
+    /// Epoch of the map at the end, from 0.
     pub epoch: u32,
     /// Epochs of the poses in `trajectory.txt`.
     pub epochs: u64,
-    /// The epoch that is compared with ground truth: the one with the most tracked frames. Each epoch
-    /// has a frame and a scale of its own; `matched_poses` says how many frames its figures cover.
+    /// The epoch that is compared with ground truth: the one with the most tracked frames. Each epoch has a separate
+    /// coordinate frame and scale; `matched_poses` is the number of frames that its figures cover.
     pub evaluated_epoch: Option<u32>,
-    /// From a frame's stamp to its sending by capture: what is late before the tracker's deadline begins. Live only.
+    /// From a frame's stamp to its sending by capture: lateness before the tracker's deadline begins. Live only.
     pub send_ms: Option<Percentiles>,
-    /// How late poses were.
+    /// Latency of the poses.
     #[serde(flatten)]
     pub latency: LatencySummary,
-    /// Time that the tracker was allowed for a frame.
+    /// Time allowed to the tracker for a frame.
     pub deadline_ms: Option<f64>,
     /// Frames published later than that.
     pub deadline_misses: Option<u64>,
     /// Page faults of the tracker's frame loop after its first hundred frames.
     pub page_faults: Option<u64>,
-    /// Processes that were started again.
+    /// Processes that were restarted.
     pub restarts: u64,
-    /// Of them each process by its name.
+    /// The same by process name.
     pub restarts_by_process: BTreeMap<String, u64>,
-    /// Why, each cause with how often.
+    /// Their causes, each with its count.
     pub restart_causes: Vec<RestartCause>,
-    /// Frames with a pose that the mapper did not take in because newer ones had come. Null in one process.
+    /// Frames with a pose that the mapper skipped because newer ones had arrived. Null in one process.
     pub frames_skipped_by_mapper: Option<u64>,
     /// Time in the tracker and in the mapper.
     #[serde(flatten)]
@@ -282,11 +282,11 @@ pub struct Summary {
     /// The search for loops.
     #[serde(flatten)]
     pub loops: LoopSummary,
-    /// Quality of a pose as a function of the iterations it is given; of replays.
+    /// Quality of a pose as a function of its iterations; replay only.
     pub budget_curve: Option<BudgetCurve>,
-    /// First to last stamp.
+    /// From the first to the last stamp.
     pub recorded_secs: f64,
-    /// Time that the run took.
+    /// Duration of the run.
     pub wall_secs: f64,
     /// Recorded duration over wall time.
     pub realtime_factor: Option<f64>,
@@ -300,21 +300,21 @@ pub struct Summary {
     /// Errors of the tracked poses against their covariance, with the map's own depth.
     #[serde(flatten)]
     pub nees: NeesSummary,
-    /// The same of their places in the map, as they were published.
+    /// The same for their poses in the map, as published.
     pub map_nees: NeesSummary,
-    /// The same of their velocities.
+    /// The same for their velocities.
     pub velocity_nees: NeesSummary,
     /// Depth of the keyframes against ground truth.
     #[serde(flatten)]
     pub depth: DepthSummary,
 }
 
-/// One time that the map was found to contradict itself.
+/// A contradiction found in the map.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RejectionSummary {
-    /// Sequence of the frame that showed it.
+    /// Sequence of the frame that revealed it.
     pub sequence: u64,
-    /// How, in words.
+    /// The contradiction, in words.
     pub reason: String,
 }
 
@@ -326,8 +326,8 @@ fn secs(nanos: u64) -> f64 {
 }
 
 impl Summary {
-    /// The figures of `record`, with so many `points` and what the evaluations gave: `nees` on keyframes, in the map and
-    /// of velocities.
+    /// The figures of `record`, with its `points` and the results of the evaluations: `nees` on keyframes, in the map
+    /// and of velocities.
     pub fn new(
         record: &RunRecord,
         points: PointCounts,
@@ -398,7 +398,7 @@ fn rejections(all: &[Rejection]) -> Vec<RejectionSummary> {
     all.iter().map(in_words).collect()
 }
 
-/// How a run ended in a word, what failed, and when a run that was recovered ended.
+/// How a run ended in a word, what failed, and when a recovered run ended.
 fn end_in_words(ended: &EndOfRun) -> (String, Option<String>, Option<String>) {
     let (word, failure, recovered) = match ended {
         EndOfRun::Finished => ("finished", None, None),
@@ -409,7 +409,7 @@ fn end_in_words(ended: &EndOfRun) -> (String, Option<String>, Option<String>) {
     (word.to_owned(), failure, recovered)
 }
 
-/// Keyframes that have a pose alone.
+/// Keyframes that have only a pose.
 pub fn without_depth(map: &Map) -> u64 {
     map.keyframes.iter().filter(|keyframe| keyframe.points.is_empty()).count() as u64
 }
@@ -444,12 +444,12 @@ fn is_lost(state: TrackingState) -> bool {
     matches!(state, TrackingState::Lost(_))
 }
 
-/// Epochs of the poses that are written: one that was joined to another is no epoch of its own.
+/// Epochs of the poses that are written: one that was joined to another does not count.
 fn count_epochs(record: &RunRecord) -> u64 {
     final_poses(record).iter().map(|of| of.epoch).collect::<BTreeSet<_>>().len() as u64
 }
 
-/// Entries into Lost.
+/// Transitions to Lost.
 fn count_losses(poses: &[RecordedPose]) -> u64 {
     let mut was_lost = false;
     let mut losses = 0;

@@ -11,7 +11,7 @@ use crate::service::results::times::Percentiles;
 use crate::slam::counted::counted;
 use crate::slam::evaluation::grade::Grade;
 
-/// The lines, each ended.
+/// The lines, each with its end.
 pub fn summary_text(summary: &Summary) -> String {
     let mut lines = Lines(String::new());
     lines.add("frames", [frames(summary)]);
@@ -25,7 +25,7 @@ pub fn summary_text(summary: &Summary) -> String {
     lines.add("errors", evaluated(summary));
     lines.add("trajectory", trajectory_errors(&summary.trajectory));
     lines.add("online", trajectory_errors(&summary.online));
-    // What no frame has confirmed is not judged.
+    // Depth that no frame has confirmed is not judged.
     lines.add("depth", depth_errors(&summary.depth).filter(|_| !is_unproven(summary)));
     lines.add("track", summary.times.track_ms.as_ref().map(times_text));
     lines.add("map", summary.times.map_ms.as_ref().map(times_text));
@@ -44,7 +44,7 @@ pub fn summary_text(summary: &Summary) -> String {
 struct Lines(String);
 
 impl Lines {
-    /// A line for each value; none where there is none.
+    /// Adds a line for each value.
     fn add(&mut self, name: &str, values: impl IntoIterator<Item = String>) {
         for value in values {
             // Writing to a string cannot fail.
@@ -53,7 +53,7 @@ impl Lines {
     }
 }
 
-/// What the map holds.
+/// The contents of the map.
 fn map(summary: &Summary) -> String {
     let without_depth = match summary.keyframes_without_depth {
         0 => String::new(),
@@ -69,19 +69,19 @@ fn map(summary: &Summary) -> String {
     )
 }
 
-/// Whether there is a map that no frame has confirmed: it began with the last frames, was lost at once, or the camera was
-/// not found in it.
+/// Whether there is a map that no frame has confirmed: it began with the last frames, was lost at once, or the camera
+/// was not located in it.
 pub(super) fn is_unproven(summary: &Summary) -> bool {
     summary.frames.frames_tracked == 0 && summary.keyframes > 0
 }
 
-/// Whose errors follow; nothing where there is one epoch alone.
+/// The epoch of the errors that follow; `None` where there is only one epoch.
 fn evaluated(summary: &Summary) -> Option<String> {
     let epoch = summary.evaluated_epoch.filter(|_| summary.epochs > 1)?;
     Some(format!("below are those of epoch {epoch}, the longest of {}", summary.epochs))
 }
 
-/// Poses that came late; nothing where nothing waits for them.
+/// Poses that were late; `None` without a deadline.
 fn deadline(summary: &Summary) -> Option<String> {
     let (deadline_ms, misses) = (summary.deadline_ms?, summary.deadline_misses?);
     let late = counted(misses, "pose");
@@ -98,20 +98,20 @@ fn depth_errors(depth: &DepthSummary) -> Option<String> {
     Some(format!("median relative error {all:.1} %, {best:.1} % over the more certain half{unit}"))
 }
 
-/// The level and at most two reasons; what it cannot see is in the report.
+/// The level and at most two reasons; the report lists what it cannot see.
 fn grade_text(grade: &Grade) -> String {
     let reasons: Vec<&str> = grade.reasons.iter().take(2).map(String::as_str).collect();
     format!("{}: {}", grade.level.name(), reasons.join("; "))
 }
 
-/// What the last line of a recovery says of the run; empty of any other run.
+/// Part of a recovery's last line, on the run; empty for any other run.
 pub fn recovery_text(summary: &Summary) -> String {
     summary.recovered_run_end.as_ref().map_or(String::new(), |end| {
         format!(", recovered from the journal of a run that ended at {end}")
     })
 }
 
-/// What the last line of a run says of images that could not be used; empty where all could.
+/// Part of a run's last line, on unusable images; empty where all were usable.
 pub fn refused_text(summary: &Summary) -> String {
     match summary.frames_refused {
         0 => String::new(),
@@ -165,7 +165,7 @@ fn trajectory_errors(trajectory: &TrajectorySummary) -> Option<String> {
     Some(text)
 }
 
-/// What the joint estimation of keyframes did; nothing where it had nothing to do.
+/// Outcome of the joint estimation of keyframes; `None` without estimates.
 fn joint_text(joint: &JointSummary) -> Option<String> {
     let times = times_text(joint.adjustment_ms.as_ref()?);
     let JointSummary { adjustments, adjustments_merged, adjustments_dropped, .. } = *joint;
@@ -175,7 +175,7 @@ fn joint_text(joint: &JointSummary) -> Option<String> {
     ))
 }
 
-/// What the search for loops came to; nothing where none was made.
+/// Outcome of the search for loops; `None` without searches.
 pub(super) fn loops_text(loops: &LoopSummary) -> Option<String> {
     let times = times_text(loops.loop_search_ms.as_ref()?);
     let of = |count: Option<u64>| count.unwrap_or(0);
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn one_of_a_thing_is_no_plural() {
+    fn a_count_of_one_is_singular() {
         let mut summary = summary(&run(TrackingState::Tracking));
         (summary.gaps, summary.joint.adjustments) = (1, 1);
         summary.joint.adjustment_ms = summary.times.map_ms;

@@ -27,7 +27,7 @@ pub struct Percentiles {
 }
 
 impl Percentiles {
-    /// Percentiles (nearest rank) of times in nanoseconds; `None` of none.
+    /// Percentiles (nearest rank) of times in nanoseconds; `None` where there are none.
     pub fn of(nanos: impl Iterator<Item = u64>) -> Option<Self> {
         let mut millis: Vec<f64> = nanos.map(|n| n as f64 * 1e-6).collect();
         millis.sort_by(f64::total_cmp);
@@ -40,13 +40,13 @@ impl Percentiles {
         Some(Self { mean, p50, p95, p99, p999: at(0.999)?, max: at(1.0)? })
     }
 
-    /// Percentiles of times that were counted: right to a few per cent, the longest is where its bucket ends.
+    /// Percentiles of counted times: accurate to a few per cent, the longest is the end of its bucket.
     pub fn of_counts(counts: &TimeCounts) -> Option<Self> {
         Self::at(mean_ms(&counts.0)?, |share| percentile_ms(&counts.0, share))
     }
 }
 
-/// How often each time came.
+/// How often each time occurred.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Histogram {
     /// Upper ends of the buckets that are not empty, milliseconds: half octaves.
@@ -56,7 +56,7 @@ pub struct Histogram {
 }
 
 impl Histogram {
-    /// Histogram of times in nanoseconds; `None` of none.
+    /// Histogram of times in nanoseconds; `None` where there are none.
     pub fn of(nanos: impl Iterator<Item = u64>) -> Option<Self> {
         let mut counts = [0; HISTOGRAM_BUCKETS];
         nanos.for_each(|nanos| counts[bucket(nanos)] += 1);
@@ -68,23 +68,23 @@ impl Histogram {
     }
 }
 
-/// How late poses were, and what the tracker took of it.
+/// Latency of poses, and the tracker's part of it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct LatencySummary {
     /// From a frame's stamp to its pose's publication.
     pub latency_ms: Option<Percentiles>,
-    /// From a frame's sending to the tracker's look at it.
+    /// From a frame's sending to its pick-up by the tracker.
     pub wake_ms: Option<Percentiles>,
-    /// How often each latency came.
+    /// How often each latency occurred.
     pub latency_histogram: Option<Histogram>,
-    /// How often each time in the tracker came.
+    /// How often each time in the tracker occurred.
     pub track_histogram: Option<Histogram>,
-    /// How often each wake-up time came.
+    /// How often each wake-up time occurred.
     pub wake_histogram: Option<Histogram>,
 }
 
 impl LatencySummary {
-    /// Of the poses of a run.
+    /// Latencies of the poses of a run.
     pub fn of(poses: &[RecordedPose]) -> Self {
         let latencies = || poses.iter().filter_map(|pose| pose.latency_nanos);
         let wakes = || poses.iter().filter_map(|pose| pose.wake_nanos);
@@ -98,7 +98,7 @@ impl LatencySummary {
     }
 }
 
-/// Times in the tracker, nanoseconds. A frame without a keyframe costs nothing and tells nothing.
+/// Times in the tracker, nanoseconds. A frame without a keyframe costs nothing and is left out.
 pub fn track_nanos(poses: &[RecordedPose]) -> impl Iterator<Item = u64> {
     let has_keyframe = |pose: &&RecordedPose| pose.estimate.keyframe_id != NO_KEYFRAME;
     poses.iter().filter(has_keyframe).filter_map(|pose| pose.track_nanos)
@@ -109,7 +109,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_mean_is_that_of_all_times_and_of_counted_ones_within_their_buckets() {
+    fn the_mean_is_exact_for_times_and_within_buckets_for_counts() {
         let times = [1_000_000, 2_000_000, 9_000_000];
         let exact = Percentiles::of(times.into_iter()).unwrap();
         assert!((exact.mean - 4.0).abs() < 1e-12 && exact.p50 == 2.0, "{exact:?}");

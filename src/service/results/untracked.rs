@@ -1,4 +1,4 @@
-//! Why a run has tracked nothing, from what its start has seen.
+//! Why a run has tracked nothing, according to what its start saw.
 
 use std::fmt;
 
@@ -11,17 +11,17 @@ use crate::slam::keyframe::Keyframe;
 use crate::slam::mapper::situation::StartFrame;
 use crate::slam::pose::{LostReason, TrackingState};
 
-/// Fewest frames from which a map can begin and one be tracked on it: a start is confirmed by its third.
+/// Fewest frames with which a map can begin and one be tracked on it: a start is confirmed by its third.
 const FEWEST_FRAMES: u64 = 5;
 
-/// The machine handled too few of the frames.
+/// The machine mapped too few of the frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Slowness {
     /// Frames from the source.
     pub frames_in: u64,
-    /// Of them, the frames that the mapper had no time for.
+    /// Those that the mapper had no time for.
     pub skipped: u64,
-    /// Median time of the mapper for a frame, milliseconds; 0 where it handled none.
+    /// Median time of the mapper for a frame, milliseconds; 0 where it mapped none.
     pub map_ms: f64,
     /// Time between two frames, milliseconds.
     pub period_ms: f64,
@@ -42,15 +42,15 @@ impl fmt::Display for Slowness {
 /// Why nothing was tracked, and what to do.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Untracked {
-    /// There was no frame.
+    /// The source gave no frame.
     NoFrame,
-    /// There were too few.
+    /// There were too few: this many.
     FewFrames(u64),
-    /// Poses were to be given, but none is near a frame.
+    /// Poses were to be given, but none is close to a frame.
     NoGivenPose,
-    /// Too few of them could be handled.
+    /// The machine mapped too few of them.
     TooSlow(Slowness),
-    /// Most frames came to this, so many of so many.
+    /// Most frames had this outcome: their number, and that of all.
     Seen(StartFrame, u64, u64),
     /// A map began, but no frame could be tracked on it.
     LostAtOnce {
@@ -58,7 +58,7 @@ pub enum Untracked {
         began: u64,
         /// Why its first frame was lost.
         reason: LostReason,
-        /// The machine was too slow as well.
+        /// Set where the machine was too slow as well.
         slowness: Option<Slowness>,
     },
 }
@@ -82,8 +82,7 @@ impl Untracked {
         let all: u64 = record.start.0.values().sum();
         let most = record.start.0.iter().max_by_key(|(_, count)| **count);
         let (&seen, &count) = most.unwrap_or((&StartFrame::Begun, &0));
-        // Between frames that are far apart nothing can be proven; darkness and a camera that stands still show
-        // all the same.
+        // Nothing can be proven between frames that are far apart; darkness and a still camera show all the same.
         let is_far_apart =
             matches!(seen, StartFrame::Unmatched | StartFrame::Turned | StartFrame::LittleParallax);
         let slowness = slowness(record, frames_in);
@@ -96,7 +95,7 @@ impl Untracked {
         })
     }
 
-    /// Of a run with lost frames: a frame is lost only where there is a map.
+    /// For a run with lost frames: a frame is lost only where there is a map.
     fn lost_at_once(record: &RunRecord, frames_in: u64) -> Option<Self> {
         let mut estimates = record.poses.iter().map(|pose| &pose.estimate);
         let (lost, reason) = estimates.find_map(|estimate| match estimate.state {
@@ -115,7 +114,7 @@ impl Untracked {
     }
 }
 
-/// Whether a live run left out so many frames that the rest are too far apart.
+/// Set where a live run left out so many frames that the rest are too far apart.
 fn slowness(record: &RunRecord, frames_in: u64) -> Option<Slowness> {
     let skipped = frames_in.saturating_sub(record.map_nanos.len() as u64);
     if !is_overloaded(record.mode, skipped, frames_in) {
@@ -207,9 +206,8 @@ pub(super) mod tests {
     use crate::slam::pose::PoseEstimate;
     use crate::wire::conversion::{PoseTiming, pose_message};
 
-    /// A live run of `frames` frames with these states from its tenth on, of which the mapper handled `handled`
-    /// and found them too little like the first.
-    /// A run without a map.
+    /// A live run of `frames` frames without a map, in this state from its tenth frame on, of which the mapper mapped
+    /// `handled` and found them too unlike the first.
     pub(in crate::service::results) fn record(
         frames: u64,
         handled: u64,
@@ -254,7 +252,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn lost_frames_tell_that_a_map_began() {
+    fn lost_frames_show_that_a_map_began() {
         let lost = TrackingState::Lost(LostReason::TooFewInliers);
         let text = |record: &RunRecord| Untracked::of(record).unwrap().to_string();
         let of_lost = text(&record(60, 60, lost));

@@ -1,4 +1,4 @@
-//! What depth variance does to the weights of a keyframe's points, for three motions of the camera.
+//! The effect of depth variance on the weights of a keyframe's points, for three motions of the camera.
 
 use nalgebra::Vector6;
 
@@ -25,14 +25,13 @@ const SCALE: [usize; 2] = [120, 12];
 const GROUND: Rgb = [255, 255, 255];
 const INK: Rgb = [28, 34, 48];
 
-/// The keyframe with its inverse depth, then the weights 1/σ_r² of its points for a pure rotation,
-/// a translation along z and one along x, each as a share of the weight without depth variance
-/// (Engel, Schöps, Cremers 2014, fig. 4). On the finest level that is tracked, with the weighting
-/// and the typical translation of `params`; the rotation moves the image as far. `None` where the keyframe
-/// cannot be aligned to.
+/// The keyframe with its inverse depth, then the weights 1/σ_r² of its points for a pure rotation, a translation along
+/// z and one along x, each as a share of the weight without depth variance (Engel, Schöps, Cremers 2014, fig. 4). On
+/// the finest tracked level, with the weighting and the typical translation of `params`; the rotation moves the image
+/// as far. `None` where frames cannot be aligned to the keyframe.
 pub fn weight_picture(keyframe: &Keyframe, params: &TrackerParams) -> Option<Picture> {
     let level = params.reference.finest_level;
-    // Every point that the tracker could choose from.
+    // Every point that the tracker could select.
     let all = ReferenceParams {
         point_budget: [MAX_KEYFRAME_POINTS; MAX_LEVELS],
         ..params.reference.clone()
@@ -76,7 +75,7 @@ pub fn weight_picture(keyframe: &Keyframe, params: &TrackerParams) -> Option<Pic
     ]))
 }
 
-/// A picture with its caption and what its colours mean.
+/// A picture with its caption and the meaning of its colours.
 struct Panel {
     caption: &'static str,
     picture: Picture,
@@ -145,7 +144,7 @@ mod tests {
     use crate::slam::alignment::scene::{small_camera, small_plane};
 
     #[test]
-    fn a_rotation_leaves_every_weight_and_a_translation_does_not() {
+    fn a_rotation_keeps_every_weight_and_a_translation_does_not() {
         let keyframe = small_plane().keyframe(&small_camera(), 1, 0.1);
         let params = TrackerParams::default();
         let picture = weight_picture(&keyframe, &params).unwrap();
@@ -153,7 +152,7 @@ mod tests {
             (picture.width, picture.height),
             (4 * (160 + GAP) + GAP, 120 + 2 * CAPTION_HEIGHT)
         );
-        // Colours of a panel's points: what is not grey.
+        // Colours of a panel's points: pixels that are not grey.
         let coloured = |panel: usize| -> Vec<Rgb> {
             let left = GAP + panel * (160 + GAP);
             let rows = picture.pixels.chunks(picture.width).skip(CAPTION_HEIGHT).take(120);

@@ -1,5 +1,5 @@
-//! What a keyframe looks like, in its file: number of features (u32), each column and row (u16), orientation, scale (u8)
-//! and descriptor (4 × u64); the CRC-32 of these (u32).
+//! The appearance of a keyframe, in its file: number of features (u32); for each column and row (u16), orientation,
+//! scale (u8) and descriptor (4 × u64); the CRC-32 of these (u32).
 
 use zerocopy::IntoBytes;
 
@@ -14,7 +14,7 @@ const NUMBER_BYTES: usize = 4;
 /// Most bytes of a description.
 pub(super) const MOST_BYTES: usize = 2 * NUMBER_BYTES + MAX_FEATURES * FEATURE_BYTES;
 
-/// Its bytes.
+/// Encodes a description.
 pub(super) fn encode(description: &Description) -> Vec<u8> {
     let features = description.features();
     let mut bytes = Vec::with_capacity(MOST_BYTES);
@@ -29,7 +29,7 @@ pub(super) fn encode(description: &Description) -> Vec<u8> {
     bytes
 }
 
-/// The description of an image of `camera`; `None` where a bit is wrong, or there is none.
+/// Decodes the description of an image of `camera`; `None` where it is damaged or absent.
 pub(super) fn decode(bytes: &[u8], camera: &Intrinsics) -> Option<Description> {
     let (body, checksum) = bytes.split_last_chunk::<NUMBER_BYTES>()?;
     let (count, features) = body.split_first_chunk::<NUMBER_BYTES>()?;

@@ -1,15 +1,15 @@
-//! Where the points of a keyframe are: one bit for each pixel, or, where that is shorter, how many pixels lie between one
-//! point and the next: a byte, after one of 255 for each 255 of them.
+//! Positions of a keyframe's points: one bit per pixel or, where that is shorter, the number of pixels between one
+//! point and the next: a byte, after one of 255 for every 255 of them.
 
-/// A byte that stands for so many pixels and is not the last of its number.
+/// A byte that counts this many pixels and is not the last of its number.
 const MORE: u8 = u8::MAX;
 
-/// Bytes of one bit a pixel.
+/// Bytes at one bit per pixel.
 pub(super) fn bit_bytes(num_pixels: usize) -> usize {
     num_pixels.div_ceil(8)
 }
 
-/// The shorter code of pixels in order, each once.
+/// The shorter code of pixels, which are in order, each once.
 pub(super) fn encode(pixels: impl Iterator<Item = usize> + Clone, num_pixels: usize) -> Vec<u8> {
     let mut gaps = Vec::new();
     let mut next = 0;
@@ -27,7 +27,7 @@ pub(super) fn encode(pixels: impl Iterator<Item = usize> + Clone, num_pixels: us
     gaps
 }
 
-/// The pixels of a code that [`encode`] made, in order, each once and below `num_pixels`; `None` where there are not
+/// The pixels of a code from [`encode`], in order, each once and below `num_pixels`; `None` where their number is not
 /// `count`.
 pub(super) fn decode(code: &[u8], num_pixels: usize, count: usize) -> Option<Vec<usize>> {
     let mut pixels = Vec::with_capacity(count.min(num_pixels));
@@ -60,7 +60,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn few_and_many_pixels_come_back() {
+    fn few_and_many_pixels_are_decoded() {
         const NUM: usize = 5003;
         for (step, is_short) in
             [(1, false), (2, false), (28, true), (255, true), (256, true), (600, true)]
@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_code_is_refused() {
+    fn an_invalid_code_is_refused() {
         assert_eq!(decode(&[5, 6], 1000, 3), None, "one is missing");
         assert_eq!(decode(&[5, 255], 1000, 1), None, "cut");
         assert_eq!(decode(&[255, 255, 255, 255], 100, 4), None);

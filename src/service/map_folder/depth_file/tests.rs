@@ -1,4 +1,4 @@
-//! A keyframe comes back from its file, and a damaged file is an error.
+//! A keyframe survives its file, and a damaged file is an error.
 
 use super::*;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -29,7 +29,7 @@ fn decoded(bytes: &[u8]) -> Result<Keyframe, DepthFileError> {
 }
 
 #[test]
-fn full_detail_gives_the_same_bits_back() {
+fn full_detail_is_read_back_bit_for_bit() {
     for own in [0.0, 0.25] {
         let of = keyframe(own);
         let bytes = encode(&of, MapDetail::Full);
@@ -42,9 +42,9 @@ fn full_detail_gives_the_same_bits_back() {
 }
 
 #[test]
-fn small_detail_takes_half_a_byte_a_pixel_and_stays_near() {
+fn small_detail_takes_half_a_byte_per_pixel_and_stays_close() {
     let mut of = keyframe(0.0);
-    // A view of a room, not of noise.
+    // A view of a room, not noise.
     of.image = (0..WIDTH * HEIGHT).map(|i| ((i % WIDTH) * 3 + i / WIDTH) as u8).collect();
     let bytes = encode(&of, MapDetail::Small);
     assert!(bytes.len() <= HEAD_BYTES + 4 + WIDTH * HEIGHT / 2, "{}", bytes.len());
@@ -58,7 +58,7 @@ fn small_detail_takes_half_a_byte_a_pixel_and_stays_near() {
     }
     let furthest = of.image.iter().zip(&small.image[..]).map(|(a, b)| a.abs_diff(*b)).max();
     assert!(furthest <= Some(8), "{furthest:?}");
-    // What was small stays the same when it is written again.
+    // A small one stays the same when it is written again.
     assert!(decoded(&encode(&small, MapDetail::Full)).unwrap() == small);
 }
 
@@ -79,7 +79,7 @@ fn every_cut_and_every_wrong_bit_is_an_error() {
 }
 
 #[test]
-fn hostile_sizes_and_numbers_with_a_right_checksum_are_refused() {
+fn invalid_sizes_and_numbers_with_a_valid_checksum_are_refused() {
     let whole = encode(&keyframe(0.0), MapDetail::Full);
     let with = |at: usize, value: &[u8]| {
         let mut bytes = whole.clone();
@@ -107,7 +107,7 @@ fn hostile_sizes_and_numbers_with_a_right_checksum_are_refused() {
     assert!(with(HEAD_BYTES, &[0xff]).is_err(), "a bit more than there are points");
 }
 
-/// A keyframe that is described.
+/// A keyframe with a description.
 fn described() -> Keyframe {
     let feature = |k: u16| Feature {
         place: FeaturePlace {
@@ -123,7 +123,7 @@ fn described() -> Keyframe {
 }
 
 #[test]
-fn a_description_comes_back_and_damage_in_it_costs_nothing_else() {
+fn a_description_is_read_back_and_damage_to_it_costs_nothing_else() {
     let of = described();
     for detail in [MapDetail::Full, MapDetail::Small] {
         let whole = encode(&of, detail);
@@ -149,9 +149,9 @@ fn a_description_comes_back_and_damage_in_it_costs_nothing_else() {
 }
 
 #[test]
-fn a_description_of_what_is_not_in_the_image_is_none() {
+fn an_invalid_description_is_left_out() {
     let whole = encode(&described(), MapDetail::Full);
-    // The first feature's column, row, orientation, scale; with a right checksum.
+    // The first feature's column, row, orientation, scale; with a valid checksum.
     for (at, value) in [(0, 65), (2, 48), (4, 32), (5, 7)] {
         let mut bytes = whole.clone();
         bytes[HEAD_BYTES + 4 + at] = value;
@@ -167,7 +167,7 @@ fn a_description_of_what_is_not_in_the_image_is_none() {
 }
 
 #[test]
-fn files_of_the_version_before_are_read() {
+fn files_of_the_previous_version_are_read() {
     for detail in [MapDetail::Full, MapDetail::Small] {
         let of = keyframe(0.0);
         let now = encode(&of, detail);

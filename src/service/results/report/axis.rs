@@ -1,4 +1,4 @@
-//! Axes of a chart: ranges that hold the points, ticks at round numbers.
+//! Axes of a chart: ranges that contain the points, ticks at round numbers.
 
 /// A range of values shown on an axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -9,14 +9,14 @@ pub struct Range {
     pub high: f64,
 }
 
-/// Share of the range left free beside the outermost points.
+/// Margin beyond the outermost points, as a share of the range.
 const MARGIN_RATIO: f64 = 0.04;
 
-/// Ticks that an axis aims at.
+/// Number of ticks to aim for.
 const TICKS: f64 = 6.0;
 
 impl Range {
-    /// The range of the finite ones of `values`, with a margin; 0 to 1 of none.
+    /// The range of the finite `values`, with a margin; 0 to 1 where there are none.
     pub fn around(values: impl Iterator<Item = f64>) -> Self {
         let (low, high) = values
             .filter(|value| value.is_finite())
@@ -35,7 +35,7 @@ impl Range {
         Self { low: low - half, high: high + half }
     }
 
-    /// The same range begun at zero, for quantities that cannot be negative.
+    /// The range from zero to its upper end, for quantities that cannot be negative.
     pub fn begun_at_zero(self) -> Self {
         Self { low: 0.0, high: if self.high > 0.0 { self.high } else { 1.0 } }
     }
@@ -51,7 +51,7 @@ impl Range {
         Self { low: middle - 0.5 * width, high: middle + 0.5 * width }
     }
 
-    /// Of a range of decimal logarithms: the powers of ten within, with the text for each.
+    /// For a range of decimal logarithms: the powers of ten within, with their text.
     pub fn decade_ticks(self) -> Vec<(f64, String)> {
         let exponents = self.low.ceil() as i32..=self.high.floor() as i32;
         // A range of f64 spans some six hundred decades.
@@ -64,7 +64,7 @@ impl Range {
         exponents.step_by(stride).map(tick).collect()
     }
 
-    /// Round values within the range, with the text for each.
+    /// Round values within the range, with their text.
     pub fn ticks(self) -> Vec<(f64, String)> {
         let step = round_step(self.width() / TICKS);
         let decimals = (-step.log10().floor()).clamp(0.0, 12.0) as usize;
@@ -76,7 +76,7 @@ impl Range {
         let tick = |i: usize| {
             let value = (first + i as f64) * step;
             let text = format!("{value:.decimals$}");
-            // A tick at −0 is zero.
+            // A tick at −0 is written as 0.
             let zero = text.trim_start_matches('-').chars().all(|c| c == '0' || c == '.');
             (value, if zero { "0".to_owned() } else { text })
         };
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn ranges_survive_any_values() {
+    fn ranges_accept_any_values() {
         assert_eq!(Range::around([].into_iter()), Range { low: 0.0, high: 1.0 });
         assert_eq!(Range::around([f64::NAN].into_iter()), Range { low: 0.0, high: 1.0 });
         assert_eq!(Range::around([4.0].into_iter()), Range { low: 2.0, high: 6.0 });

@@ -1,4 +1,4 @@
-//! How good a pose is after some iterations or some time: two charts of the report.
+//! Quality of a pose against iterations and against time: two charts of the report.
 
 use crate::service::results::budget_curve::{BudgetCurve, BudgetSample, displacement_by_time};
 use crate::service::results::report::chart::{Chart, Scaling};
@@ -6,17 +6,17 @@ use crate::service::results::report::charts::{ERROR, ESTIMATE};
 use crate::service::results::report::series::{Mark, Series};
 use crate::slam::evaluation::statistics::median;
 
-/// A displacement below this is none: a hundredth of what the alignment itself is right to, pixels.
+/// A smaller displacement counts as this: a hundredth of the accuracy of the alignment itself, pixels.
 const LEAST_PX: f64 = 1e-3;
 
-/// The axis of time ends at so many times the median time of a whole frame: one that another
-/// process held up would squeeze all others.
+/// The time axis ends at this many times the median time of a whole frame: one frame delayed by another process would
+/// squeeze all others.
 const SHOWN_MEDIANS: f64 = 2.0;
 
-/// Points along the axis of time.
+/// Points along the time axis.
 const TIME_STEPS: usize = 160;
 
-/// Displacement against iterations and against time; nothing where no frame was aligned again.
+/// Displacement against iterations and against time; empty where no frame was realigned.
 pub fn budget_charts(samples: &[BudgetSample], curve: Option<&BudgetCurve>) -> Vec<Chart> {
     let Some(curve) = curve else { return Vec::new() };
     let iterations = || curve.iterations.iter().map(|&n| f64::from(n));

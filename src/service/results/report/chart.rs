@@ -14,13 +14,13 @@ pub const CHART_WIDTH: f64 = 640.0;
 /// How the axes are scaled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scaling {
-    /// Each by itself.
+    /// Independently.
     Free,
-    /// Each by itself, y from zero.
+    /// Independently, y from zero.
     FromZero,
-    /// A length is as long along x as along y.
+    /// With equal units along x and y.
     Equal,
-    /// Each by itself, y in decades; only values above zero are shown.
+    /// Independently, y in decades; only values above zero are shown.
     Decades,
 }
 
@@ -29,7 +29,7 @@ pub enum Scaling {
 pub struct Chart {
     /// What it shows.
     pub title: &'static str,
-    /// What it means and what is good, in one line below it; may be empty.
+    /// Its meaning and what is good, in one line below it; may be empty.
     pub meaning: &'static str,
     /// Label of the x axis.
     pub x_label: String,
@@ -39,12 +39,12 @@ pub struct Chart {
     pub height: f64,
     /// How the axes are scaled.
     pub scaling: Scaling,
-    /// What is drawn, the first at the bottom.
+    /// The series to draw, the first at the bottom.
     pub series: Vec<Series>,
 }
 
 impl Chart {
-    /// A low chart of what changes over the run.
+    /// A low chart of a quantity over the run.
     pub fn over_time(
         title: &'static str,
         meaning: &'static str,
@@ -87,7 +87,7 @@ impl Chart {
         svg
     }
 
-    /// The ranges of the axes, a length as long along both where that is asked for.
+    /// Ranges of the axes, with equal units along both where that is requested.
     pub(super) fn frame(&self) -> Frame {
         let mut frame = self.tight_frame();
         if self.scaling == Scaling::Equal {
@@ -98,7 +98,7 @@ impl Chart {
         frame
     }
 
-    /// The ranges that the points need.
+    /// Ranges that the points need.
     pub(super) fn tight_frame(&self) -> Frame {
         let points = || self.series.iter().flat_map(|series| &series.points);
         let drawn = || {
@@ -117,7 +117,7 @@ impl Chart {
         }
     }
 
-    /// Names with a stroke of their colour, from the right end of the title's line.
+    /// Draws names with a stroke of their colour, from the right end of the title's line.
     fn draw_legend(&self, svg: &mut String) {
         const LETTER: f64 = 6.6;
         let mut right = CHART_WIDTH - MARGIN[2];
@@ -168,7 +168,7 @@ impl Chart {
     }
 }
 
-/// Charts in rows of `columns` as an SVG file with a white ground.
+/// Charts in rows of `columns` as an SVG file with a white background.
 pub fn svg_file(charts: &[Chart], columns: usize) -> String {
     let rows: Vec<&[Chart]> = charts.chunks(columns.max(1)).collect();
     let highest = |row: &[Chart]| row.iter().map(|chart| chart.height).fold(0.0, f64::max);
@@ -181,7 +181,7 @@ pub fn svg_file(charts: &[Chart], columns: usize) -> String {
     let mut top = 0.0;
     for row in rows {
         for (column, chart) in row.iter().enumerate() {
-            // Each chart brings its own viewBox; its place is given by its size.
+            // Each chart has its own viewBox; this element gives it position and size.
             let _ = write!(
                 svg,
                 "<svg x=\"{}\" y=\"{top}\" width=\"{CHART_WIDTH}\" height=\"{}\">{}</svg>",
@@ -215,7 +215,7 @@ fn draw_series(svg: &mut String, frame: &Frame, series: &Series) {
         Mark::Path => draw_line(svg, &joined(placed()), colour, "", 1.8),
         Mark::DashedPath => draw_line(svg, &joined(placed()), colour, DASH, 1.6),
         Mark::Dots(radius) => {
-            // A stroke of no length with round ends is a dot.
+            // A stroke of zero length with round ends is a dot.
             let path: String = seen().map(|[x, y]| format!("M{x:.1} {y:.1}h0")).collect();
             let round = " stroke-linecap=\"round\"";
             draw_line(svg, &path, colour, round, 2.0 * radius);
@@ -246,7 +246,7 @@ fn draw_line(svg: &mut String, path: &str, colour: &str, attributes: &str, width
     );
 }
 
-/// An SVG path through the points; one that is not finite breaks it.
+/// An SVG path through the points, broken at those that are not finite.
 fn joined(points: impl Iterator<Item = [f64; 2]>) -> String {
     let mut path = String::new();
     let mut draws = false;
@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn decades_are_equally_far_apart() {
+    fn decades_are_equally_spaced() {
         let points = vec![[0.0, 0.01], [1.0, 0.1], [2.0, 0.0], [3.0, 1.0]];
         let chart = Chart { scaling: Scaling::Decades, ..chart(Mark::Path, points) };
         let frame = chart.frame();

@@ -1,5 +1,5 @@
-//! A chart on a page: the picture for paper, its figures for the script that draws it as wide as the page is and shows the
-//! values under the pointer, and what it means.
+//! A chart on a page: the picture for print, its figures for the script that draws it as wide as the page and shows the
+//! values under the pointer, and its meaning.
 
 use serde_json::json;
 
@@ -8,7 +8,7 @@ use crate::service::results::report::chart_points::{number, points_json};
 use crate::service::results::report::html::escaped;
 use crate::service::results::report::series::{Mark, Series};
 
-/// The script, once for all charts, after them.
+/// The script, included once after all charts.
 pub const CHART_SCRIPT: &str = include_str!("chart.js");
 
 /// The `<figure>` of a chart.
@@ -24,7 +24,7 @@ pub fn chart_figure(chart: &Chart) -> String {
     )
 }
 
-/// What the script draws.
+/// Data for the script.
 fn figures_json(chart: &Chart) -> String {
     let frame = chart.tight_frame();
     let scaling = match chart.scaling {
@@ -58,7 +58,7 @@ fn figures_json(chart: &Chart) -> String {
         frame.y.high,
         series.join(",")
     );
-    // Nothing in it may end the element.
+    // Nothing in it may close the element.
     json.replace('<', "\\u003c")
 }
 

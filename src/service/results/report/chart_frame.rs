@@ -1,14 +1,14 @@
-//! Where a chart's values lie in its picture.
+//! Positions of a chart's values in its picture.
 
 use crate::service::results::report::axis::Range;
 
-/// Space left of, above, right of and below the plot.
+/// Space to the left of, above, to the right of and below the plot.
 pub(super) const MARGIN: [f64; 4] = [66.0, 34.0, 14.0, 42.0];
 
-/// Where the axes' values lie in the picture.
+/// Places values of the axes in the picture.
 pub(super) struct Frame {
     pub(super) x: Range,
-    /// Of the values, or of their decimal logarithms.
+    /// Range of the values, or of their decimal logarithms.
     pub(super) y: Range,
     pub(super) in_decades: bool,
     pub(super) width: f64,
@@ -16,7 +16,7 @@ pub(super) struct Frame {
 }
 
 impl Frame {
-    /// Where a point lies in the picture.
+    /// Position of a point in the picture.
     pub(super) fn place(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         let y = if self.in_decades { y.log10() } else { y };
         [

@@ -1,4 +1,4 @@
-//! The points of a chart's series that are drawn: few enough for a page, without losing a peak.
+//! The points of a chart's series to draw: few enough for a page, without losing a peak.
 
 use std::fmt::Write;
 
@@ -10,10 +10,10 @@ use crate::service::results::report::series::{Mark, Series};
 /// Most points that a path keeps.
 const MAX_PATH_POINTS: usize = 3000;
 
-/// An axis is written in steps of its range over this: finer than a screen shows.
+/// Coordinates are written in steps of the axis range over this: finer than a screen shows.
 const STEPS: f64 = 20_000.0;
 
-/// The points of a series that are drawn. One that is not finite breaks a line.
+/// The points of a series to draw. One that is not finite breaks a line.
 pub(super) fn thinned(frame: &Frame, series: &Series) -> Vec<[f64; 2]> {
     let points = &series.points;
     match series.mark {
@@ -23,7 +23,7 @@ pub(super) fn thinned(frame: &Frame, series: &Series) -> Vec<[f64; 2]> {
     }
 }
 
-/// Every n-th point, such that few enough are left; the last always, and the first of those that break a line.
+/// Every n-th point, few enough to draw; always the last, and the first of those that break a line.
 fn by_stride(points: &[[f64; 2]]) -> Vec<[f64; 2]> {
     let stride = points.len().div_ceil(MAX_PATH_POINTS).max(1);
     let last = points.len().saturating_sub(1);
@@ -33,7 +33,7 @@ fn by_stride(points: &[[f64; 2]]) -> Vec<[f64; 2]> {
     kept.map(|i| points[i]).collect()
 }
 
-/// A line over x: of the points that fall on one column of the picture, the first, the lowest, the highest and the last.
+/// A line over x: the first, the lowest, the highest and the last of the points in one column of the picture.
 fn by_columns(frame: &Frame, points: &[[f64; 2]]) -> Vec<[f64; 2]> {
     let column_of = |point: &[f64; 2]| {
         let placed = frame.place(*point);
@@ -56,7 +56,7 @@ fn by_columns(frame: &Frame, points: &[[f64; 2]]) -> Vec<[f64; 2]> {
     kept
 }
 
-/// The points that are drawn as a JSON array `[x, y, x, y …]`; of one that has no place both are null.
+/// The points to draw as a JSON array `[x, y, x, y …]`; both are null for one without a position.
 pub(super) fn points_json(frame: &Frame, series: &Series) -> String {
     let mut json = String::from("[");
     for [x, y] in thinned(frame, series) {
@@ -76,7 +76,7 @@ pub(super) fn points_json(frame: &Frame, series: &Series) -> String {
 
 /// A number with as many digits as the axis needs.
 pub(super) fn number(value: f64, axis: Range) -> String {
-    /// Digits behind the point that a plain number has at most.
+    /// Most decimals of a plain number.
     const MOST_DECIMALS: f64 = 9.0;
     let decimals = -(axis.width() / STEPS).log10().floor();
     if !(-MOST_DECIMALS..=MOST_DECIMALS).contains(&decimals) {

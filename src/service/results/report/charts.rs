@@ -1,4 +1,4 @@
-//! The charts of a report, from what a run recorded.
+//! The charts of a report, from the record of a run.
 
 use nalgebra::Vector3;
 
@@ -16,7 +16,7 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::trajectory::StampedPose;
 
-/// Colours that can be told apart with any sight, on white and on black: of the truth,
+/// Colours that are distinguishable with any colour vision, on white and on black: of the truth,
 pub const TRUTH: &str = "#8b929c";
 /// … of estimates,
 pub const ESTIMATE: &str = "#2f6fed";
@@ -27,7 +27,7 @@ pub const ERROR: &str = "#d6455d";
 /// … of the mapper.
 pub const MAPPING: &str = "#1f9d78";
 
-/// Bars of a histogram.
+/// Number of bars in a histogram.
 const BARS: usize = 40;
 
 /// Seconds from the first frame.
@@ -36,7 +36,7 @@ pub fn secs(record: &RunRecord, nanos: i64) -> f64 {
     nanos.saturating_sub(first) as f64 * 1e-9
 }
 
-/// The trajectory from above and from the side, in the ground truth's frame where there is one. `up` is in the map's.
+/// The trajectory from above and from the side, in the coordinates of the ground truth if any; `up` is in the map's.
 pub fn trajectory_views(results: &Results<'_>, up: Option<Vector3<f64>>) -> [Chart; 2] {
     let truth: Vec<StampedPose> = truth_in_time(results);
     let (alignment, unit) = match &results.evaluation {
@@ -52,8 +52,8 @@ pub fn trajectory_views(results: &Results<'_>, up: Option<Vector3<f64>>) -> [Cha
     trajectory_charts(&results.trajectory, &truth, &alignment, unit, &keyframes, &views)
 }
 
-/// From above and from the side, as `views` of the truth's frame has it: `truth`, and `estimate` and `keyframes` brought
-/// to its frame.
+/// From above and from the side, along `views` in the truth's coordinate frame: `truth`, and `estimate` and `keyframes`
+/// transformed into that frame.
 pub fn trajectory_charts(
     estimate: &[StampedPose],
     truth: &[StampedPose],
@@ -104,7 +104,7 @@ fn truth_in_time(results: &Results<'_>) -> Vec<StampedPose> {
     results.record.ground_truth.iter().filter(|pose| time.contains(&pose.nanos)).copied().collect()
 }
 
-/// Poses of the keyframes of the longest epoch: each epoch has a place and a unit of its own.
+/// Poses of the keyframes of the longest epoch: each epoch has a separate world and unit.
 pub(super) fn keyframe_poses(record: &RunRecord) -> Vec<StampedPose> {
     let epoch = longest_epoch(record);
     let pose = |k: &Keyframe| StampedPose {
@@ -147,7 +147,7 @@ pub fn error_chart(series: Vec<Series>) -> Chart {
     Chart { height: 280.0, ..chart }
 }
 
-/// Scale of windows of 100 frames over that of the whole; `None` below two windows.
+/// Scale of windows of 100 frames relative to that of the whole; `None` for fewer than two windows.
 pub fn scale_over_time(results: &Results<'_>) -> Option<Chart> {
     let evaluation = results.evaluation.as_ref()?;
     if evaluation.window_scales.len() < 2 {
@@ -155,7 +155,7 @@ pub fn scale_over_time(results: &Results<'_>) -> Option<Chart> {
     }
     let pairs = &evaluation.pairs;
     let time = |i: usize| pairs.get(i).map(|p| secs(results.record, results.trajectory[p.0].nanos));
-    // The last window may have matches in common with the one before.
+    // The last window may share matches with the previous one.
     let mut drawn = 0;
     let points: Vec<[f64; 2]> = evaluation
         .window_scales
@@ -176,7 +176,7 @@ pub fn scale_over_time(results: &Results<'_>) -> Option<Chart> {
     Some(Chart { height: 280.0, ..chart })
 }
 
-/// Times of tracker and mapper over the run, and how often each occurs.
+/// Times of tracker and mapper over the run, and their distribution.
 pub fn time_charts(record: &RunRecord) -> Vec<Chart> {
     let of_poses = |nanos: fn(&crate::service::results::record::RecordedPose) -> Option<u64>| {
         let samples = record.poses.iter().filter_map(|pose| {
@@ -186,7 +186,7 @@ pub fn time_charts(record: &RunRecord) -> Vec<Chart> {
     };
     let track = of_poses(|pose| pose.track_nanos);
     let latency = of_poses(|pose| pose.latency_nanos);
-    // One map step for each frame it handled; spread over the frames in order.
+    // One map step per mapped frame, spread over the frames in order.
     let spread = record.poses.len() as f64 / record.map_nanos.len().max(1) as f64;
     let map: Vec<[f64; 2]> = record
         .map_nanos
@@ -213,7 +213,7 @@ pub fn time_charts(record: &RunRecord) -> Vec<Chart> {
     charts
 }
 
-/// One kind of time, and what is said of it.
+/// One kind of time, with its texts.
 struct Times {
     over_run: &'static str,
     distribution: &'static str,
@@ -248,8 +248,8 @@ const ABOVE_MEANING: &str = "Path of the camera; keyframes are the frames that c
 const SIDE_MEANING: &str = "The same from the side, one length along both axes: how the camera rose and fell. Up is \
                             estimated from how it was held and from horizontal surfaces.";
 
-/// How many frames took how long. The range ends at the 99th percentile and a half more; what is
-/// beyond is counted in the last bar.
+/// Distribution of the times of frames. The range ends at 1.5 times the 99th percentile or the limit, whichever is
+/// larger; larger times are counted in the last bar.
 fn histogram(times: &Times, samples: &[[f64; 2]], limit: Option<f64>) -> Chart {
     let durations = samples.iter().map(|sample| sample[1]);
     let [p95, p99] = percentiles(durations.clone(), [0.95, 0.99]).unwrap_or_default();

@@ -1,4 +1,4 @@
-//! One picture of a trajectory against ground truth, as a file of its own.
+//! One picture of a trajectory against ground truth, as a separate file.
 
 use nalgebra::Vector3;
 
@@ -12,8 +12,8 @@ use crate::slam::evaluation::epochs::EpochsEvaluation;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::trajectory::StampedPose;
 
-/// Both trajectories from above and from the side and the position error over time, one below the
-/// other, as an SVG file with a white ground. No line leads from one epoch to another.
+/// Both trajectories from above and from the side and the position error over time, one below the other, as an SVG file
+/// with a white background. No line connects two epochs.
 pub fn evaluation_plot(evaluation: &EpochsEvaluation, truth: &[StampedPose]) -> String {
     let placed: Vec<StampedPose> = evaluation.placed.iter().map(|of| of.pose).collect();
     let first = placed.iter().map(|pose| pose.nanos).min().unwrap_or(0);
@@ -27,7 +27,7 @@ pub fn evaluation_plot(evaluation: &EpochsEvaluation, truth: &[StampedPose]) -> 
     let errors = with_gaps(epochs, &points, [f64::NAN; 2]);
     let errors = Series::new("error", ERROR, Mark::Line, errors);
     let views = Views::of(if truth.is_empty() { &placed } else { &truth }, None);
-    // What has no place in a chart breaks its line.
+    // A point without a position breaks its line.
     let translation = Vector3::repeat(f64::NAN);
     let nowhere =
         StampedPose { nanos: 0, world_from_camera: SE3 { translation, ..SE3::identity() } };
@@ -60,8 +60,8 @@ mod tests {
     use crate::slam::trajectory::EpochPose;
 
     #[test]
-    fn no_line_leads_from_one_epoch_to_another() {
-        // More than a chart draws, so that they are thinned.
+    fn no_line_connects_two_epochs() {
+        // More points than a chart draws, so that they are thinned.
         let truth: Vec<StampedPose> = (0..20_000)
             .map(|i| {
                 let t = f64::from(i) * 1e-3;

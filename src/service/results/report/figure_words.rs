@@ -1,6 +1,6 @@
-//! What the figures of `summary.json` are called on the page, and what each means.
+//! Names and meanings of the figures of `summary.json` on the page.
 
-/// Where a figure stands on the page.
+/// The section of a figure on the page.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Group {
     /// The run as a whole.
@@ -48,7 +48,7 @@ pub(super) const GROUPS: [(Group, &str); 12] = [
 /// How a figure is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Format {
-    /// As it is.
+    /// Unchanged.
     Text,
     /// A whole number.
     Count,
@@ -60,21 +60,21 @@ pub(super) enum Format {
     Metres,
     /// A share, in per cent.
     Percent,
-    /// Several numbers with their names; in per cent where `true`.
+    /// Several named numbers; in per cent where `true`.
     Named([&'static str; 3], bool),
-    /// Median, percentiles and longest of a time, milliseconds.
+    /// Median, percentiles and maximum of a time, milliseconds.
     Times,
-    /// Upper ends of times and how often each came.
+    /// Upper ends of times and their counts.
     Histogram,
     /// The camera.
     Camera,
-    /// A number for each name.
+    /// One number per name.
     Counts,
-    /// Rows of a table; of each column the key, its heading and how it is written.
+    /// Rows of a table; key, heading and format of each column.
     Rows(&'static [(&'static str, &'static str, Format)]),
-    /// Figures that have entries of their own, in another group.
+    /// Figures with separate entries, in another group.
     Nested(Group),
-    /// Has a place of its own on the page.
+    /// Drawn elsewhere on the page.
     Drawn,
 }
 
@@ -83,13 +83,13 @@ pub(super) enum Format {
 pub(super) struct Words {
     /// Its key in `summary.json`.
     pub key: &'static str,
-    /// Where it stands.
+    /// Its group.
     pub group: Group,
-    /// What it is called.
+    /// Its name.
     pub name: &'static str,
     /// How it is written.
     pub format: Format,
-    /// What it means, and what is good.
+    /// Its meaning, and what is good.
     pub meaning: &'static str,
 }
 

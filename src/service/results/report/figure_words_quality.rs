@@ -1,11 +1,11 @@
-//! What the figures of `summary.json` that need ground truth are called on the page, and what each means.
+//! Names and meanings on the page of the figures of `summary.json` that need ground truth.
 
 use crate::service::results::report::figure_words::{Format, Group, Words, words};
 
 const MODES: [&str; 3] = ["along columns", "along rows", "relief"];
 const SIGMAS: [&str; 3] = ["1 σ", "2 σ", "3 σ"];
 
-/// Figures that need ground truth. Those of the trajectories and covariances come several times, each in its group.
+/// Figures that need ground truth. Those of the trajectories and covariances appear several times, each in its group.
 pub(super) const QUALITY_WORDS: &[Words] = words! {
     evaluated_epoch: Accuracy, Format::Count, "Epoch compared", "The epoch with the most tracked frames, counted from 0.";
     matched_poses: Accuracy, Format::Count, "Poses compared", "Poses that have ground truth.";

@@ -1,4 +1,4 @@
-//! Every figure of the summary in words, with its unit and what it means.
+//! Every figure of the summary, with its name, unit and meaning.
 
 use std::fmt::Write;
 
@@ -11,10 +11,10 @@ use crate::service::results::report::number_text::{grouped, length};
 use crate::service::results::summary::Summary;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
-/// Most columns of a histogram that are written out.
+/// Most buckets of a histogram that are written out.
 const HISTOGRAM_ROWS: usize = 40;
 
-/// The section: the figures by groups, those that are lists themselves as tables.
+/// The section: the figures by groups, lists as tables.
 pub fn figures(summary: &Summary) -> String {
     let value = serde_json::to_value(summary).unwrap_or_default();
     let mut html = String::from(
@@ -40,8 +40,8 @@ pub fn figures(summary: &Summary) -> String {
     html
 }
 
-/// The figures that are known in the order of their words, each with its group; those of nested ones in the group that the
-/// outer names.
+/// The figures with a value, in the order of their words, each with its group; those of nested ones in the group that
+/// the outer one names.
 fn placed_figures(summary: &Value) -> Vec<(Group, &'static Words, &Value)> {
     let mut placed = Vec::new();
     for words in all_words() {
@@ -59,7 +59,7 @@ fn placed_figures(summary: &Value) -> Vec<(Group, &'static Words, &Value)> {
     placed
 }
 
-/// Whether there is anything to tell.
+/// Whether a value has anything to show.
 fn has_figures(value: &Value) -> bool {
     match value {
         Value::Null => false,
@@ -100,7 +100,7 @@ fn table(html: &mut String, words: &Words, value: &Value) {
     html.push_str("</tr></table></div>");
 }
 
-/// A figure with its unit; a dash where there is none.
+/// A figure with its unit; a dash where it has no value.
 fn written(format: Format, value: &Value) -> String {
     const NONE: &str = "–";
     match (format, value) {
@@ -139,7 +139,7 @@ fn number_text(format: Format, number: f64) -> String {
     }
 }
 
-/// A number with three significant digits or all before the point.
+/// A number with three significant digits, or all digits before the point.
 fn plain(number: f64) -> String {
     const DIGITS: f64 = 2.0;
     if number == 0.0 {
@@ -201,7 +201,7 @@ mod tests {
     use crate::slam::pose::TrackingState;
     use serde_json::json;
 
-    /// A summary with every key: what is null is one as well.
+    /// A summary with every key, including those that are null.
     fn summary() -> Value {
         let counts = PointCounts { points: 0, map_points: 0, fusion_secs: 0.0 };
         let record = record(0, 0, TrackingState::Initializing);
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn figures_have_units_and_no_key_is_seen() {
+    fn figures_have_units_and_keys_are_not_shown() {
         let mut value = summary();
         let times = Percentiles { mean: 1.75, p50: 1.5, p95: 2.0, p99: 3.0, p999: 4.0, max: 12.25 };
         value["track_ms"] = json!(times);

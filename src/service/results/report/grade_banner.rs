@@ -1,11 +1,11 @@
-//! The grade at the head of the report: level, reasons, what it cannot see, and the figures.
+//! The grade at the head of the report: level, reasons, what it cannot see, and its figures.
 
 use std::fmt::Write;
 
 use crate::service::results::report::html::escaped;
 use crate::slam::evaluation::grade::{Grade, GradeLevel};
 
-/// The banner.
+/// Renders the banner.
 pub fn grade_banner(grade: &Grade) -> String {
     let class = match grade.level {
         GradeLevel::Good => "good",
@@ -32,7 +32,7 @@ pub fn grade_banner(grade: &Grade) -> String {
     html
 }
 
-/// The figures in words, those that are known.
+/// The figures that are known, with their names.
 fn figures(grade: &Grade) -> Vec<(&'static str, String)> {
     let figures = &grade.figures;
     let px = |value: Option<f64>| value.map(|px| format!("{px:.2} px"));
@@ -58,7 +58,7 @@ mod tests {
     use crate::slam::evaluation::grade::GradeInput;
 
     #[test]
-    fn a_run_that_cannot_be_judged_has_no_colour_and_says_why() {
+    fn a_run_without_a_grade_has_no_colour_and_gives_the_reason() {
         let html = grade_banner(&Grade::of(&GradeInput::default()));
         assert!(html.contains("class=\"grade unjudged\"") && html.contains("not judged"), "{html}");
         assert!(html.contains("no frame was tracked") && html.contains("cannot see"), "{html}");

@@ -1,6 +1,6 @@
 //! Pieces of HTML: escaped text, pictures as data addresses.
 
-/// Text with the characters that mean something in HTML and SVG replaced.
+/// Escapes the characters that have a meaning in HTML and SVG.
 pub fn escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for character in text.chars() {
@@ -21,7 +21,7 @@ pub fn png_address(bytes: &[u8]) -> String {
     String::from("data:image/png;base64,") + &base64(bytes)
 }
 
-/// Bytes as text (base64, RFC 4648 §4).
+/// Bytes as base64 (RFC 4648 §4).
 pub fn base64(bytes: &[u8]) -> String {
     const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut out = String::new();
@@ -42,7 +42,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn base64_of_the_standard() {
+    fn base64_matches_the_standard() {
         let vectors =
             [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foob", "Zm9vYg==")];
         for (bytes, letters) in vectors {

@@ -1,5 +1,5 @@
-//! The charts of the joint estimation: how well it explains the images over the run, its time, and what it makes of the
-//! keyframes' depth.
+//! The charts of the joint estimation: how well it explains the images over the run, its time, and the resulting depth
+//! of the keyframes.
 
 use std::collections::HashMap;
 
@@ -18,7 +18,7 @@ const INLIER_MEANING: &str = "Comparisons of a point with a keyframe that agree.
 const TIME_MEANING: &str =
     "CPU time of each joint estimate of keyframes; it runs beside tracking and mapping.";
 
-/// Residual, share of inliers and time of every joint estimate; none where there was none.
+/// Residual, share of inliers and time of every joint estimate; empty without any.
 pub fn joint_charts(record: &RunRecord) -> Vec<Chart> {
     let poses = record.poses.iter();
     let times: HashMap<u64, i64> =
@@ -62,7 +62,7 @@ pub fn joint_charts(record: &RunRecord) -> Vec<Chart> {
 const MODES_MEANING: &str = "Depth errors that all points of a keyframe share: depth that grows across the columns or rows \
                              of the image, and relief that is too strong or too weak. 0 is right.";
 
-/// The unit and the common errors of each keyframe's depth over the run; none without true depth.
+/// The unit and the common errors of each keyframe's depth over the run; empty without true depth.
 pub fn depth_charts(record: &RunRecord, keyframes: &[KeyframeDepth]) -> Vec<Chart> {
     let points = |value: &dyn Fn(&KeyframeDepth) -> Option<f64>| -> Vec<[f64; 2]> {
         let timed = keyframes.iter().map(|of| (secs(record, of.capture_nanos), value(of)));

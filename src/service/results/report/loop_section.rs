@@ -1,4 +1,4 @@
-//! What the search for loops came to, and where.
+//! The outcomes of the search for loops, and where they occurred.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -22,13 +22,13 @@ use crate::slam::counted::counted;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::loops::SearchFate;
 
-/// Radius of a loop that holds, and of a place that was refused.
+/// Radius of a loop that holds, and of a refused place.
 const LOOP_RADIUS: f64 = 4.0;
 const REFUSED_RADIUS: f64 = 2.5;
-/// Loops that are drawn, the newest: what a path keeps without being thinned, three points each.
+/// Most loops that are drawn, the newest: what a path keeps without being thinned, three points each.
 const MOST_LINKS: usize = 1000;
 
-/// Figures, why places were refused, and a view of the map from above; nothing where no loop was looked for.
+/// Figures, reasons for refusals, and a view of the map from above; empty where no loop was searched for.
 pub fn loop_section(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
     let Some(figures) = loops_text(&results.summary.loops) else { return String::new() };
     let searches = results.record.searches.as_deref().unwrap_or_default();
@@ -50,12 +50,12 @@ pub fn loop_section(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
     section
 }
 
-/// Why candidates were other places, and how often, the most frequent first.
+/// Why candidates were other places, and how often, most frequent first.
 fn reasons(searches: &[SearchRecord]) -> Vec<(String, usize)> {
     let mut counts: BTreeMap<String, usize> = BTreeMap::new();
     for search in searches {
         if let SearchFate::Refused(why) = search.report.fate {
-            // Without the value of what was measured.
+            // Without the measured value.
             let why = why.to_string();
             let why = why.split(':').next().unwrap_or_default().to_owned();
             *counts.entry(why).or_default() += 1;
@@ -66,7 +66,7 @@ fn reasons(searches: &[SearchRecord]) -> Vec<(String, usize)> {
     counts
 }
 
-/// The keyframes' path in the longest epoch, and what was found where; loops with a line between the keyframes.
+/// The keyframes' path in the longest epoch, and the outcomes along it; loops as lines between their keyframes.
 fn seen_from_above(
     record: &RunRecord,
     searches: &[SearchRecord],
@@ -92,7 +92,7 @@ fn seen_from_above(
         .rev()
         .take(MOST_LINKS)
         .filter_map(|link| Some([at(link.i)?, at(link.j)?]));
-    // A broken line: one piece for each loop.
+    // A broken line: one segment per loop.
     let links = links.flat_map(|[i, j]| [i, j, [f64::NAN; 2]]).collect();
     let line = |name, colour, points| Series { name, colour, mark: Mark::Path, points };
     let path =
@@ -113,10 +113,10 @@ fn seen_from_above(
     }
 }
 
-/// Whether a search ended so.
+/// Whether a search has a certain fate.
 type IsFate = fn(&SearchFate) -> bool;
 
-/// Where searches ended how: `of` gives the places of those with such a fate.
+/// Searches by their fate: `of` gives the positions of those with such a fate.
 fn place_series(of: &dyn Fn(IsFate) -> Vec<[f64; 2]>) -> [Series; 4] {
     let dots = |name, colour, radius, is| Series::new(name, colour, Mark::Dots(radius), of(is));
     let is_other = |fate: &SearchFate| {

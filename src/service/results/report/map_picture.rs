@@ -13,7 +13,7 @@ use crate::slam::evaluation::statistics::percentiles;
 use crate::slam::fusion::SurfacePoint;
 use crate::slam::trajectory::StampedPose;
 
-/// Width of the picture, pixels: sharp on a page twice as dense as its layout.
+/// Width of the picture, pixels: sharp on a page at twice the density of its layout.
 const WIDTH: usize = 1600;
 
 /// Largest height, as a share of the width.
@@ -22,20 +22,20 @@ const MAX_HEIGHT_RATIO: f64 = 0.7;
 /// Share of the points at either end that the picture leaves out: outliers would shrink the rest.
 const CUT_SHARE: f64 = 0.01;
 
-/// Space around what is shown, as a share of it.
+/// Margin around the content, as a share of it.
 const MARGIN_RATIO: f64 = 0.02;
 
-/// Points on a pixel that make it nearly as bright as it gets.
+/// Points on a pixel that make it nearly as bright as possible.
 const POINTS_FOR_BRIGHT: f64 = 6.0;
 
-/// Part of the rainbow that is used: its ends are as dark as the ground.
+/// Part of the rainbow that is used: its ends are as dark as the background.
 const LOWEST_COLOUR: f64 = 0.14;
 const HIGHEST_COLOUR: f64 = 0.92;
 
 const GROUND: Rgb = [16, 20, 27];
 const WAY: Rgb = [255, 255, 255];
 
-/// Least share of the picture's width that its scale bar has; the most is two and a half times as much.
+/// Smallest share of the picture's width for its scale bar; the largest is two and a half times as much.
 const LEAST_BAR: f64 = 0.14;
 
 /// The map from above.
@@ -43,13 +43,13 @@ const LEAST_BAR: f64 = 0.14;
 pub struct MapPicture {
     /// Points and path.
     pub picture: Picture,
-    /// Length that the picture's width shows, map units.
+    /// Length across the picture's width, map units.
     pub width: f64,
-    /// What the ends of the colours stand for, map units apart.
+    /// Height between the ends of the colour scale, map units.
     pub height_range: f64,
 }
 
-/// The section; nothing without points.
+/// The section; empty without points.
 pub fn map_section(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
     let map = map_picture(&results.surface, &results.trajectory, up);
     let Some(map) = map else { return String::new() };
@@ -71,7 +71,7 @@ pub fn map_section(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
     )
 }
 
-/// A bar over a picture of this width, with its length, and in metres where the map unit is known.
+/// A scale bar for a picture of this width, with its length, also in metres where the map unit is known.
 fn scale_bar(width: f64, unit: &str, metres_per_unit: Option<f64>) -> String {
     let length = round_step(LEAST_BAR * width);
     let metres = metres_per_unit.map(|scale| format!(" = {} m", significant(length * scale)));
@@ -128,7 +128,7 @@ pub fn map_picture(
     Some(MapPicture { picture, width, height_range: high - low })
 }
 
-/// The picture, and the length that its width shows.
+/// The picture, and the length across its width.
 fn draw(points: &[[f64; 3]], path: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> (Picture, f64) {
     let [x, y, z] = ranges;
     let (x_width, y_width) = (x[1] - x[0], y[1] - y[0]);
@@ -143,7 +143,7 @@ fn draw(points: &[[f64; 3]], path: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> (Pict
     };
     let mut counts = vec![(0u32, 0.0f64); WIDTH * height];
     for &[px, py, pz] in points {
-        // Two pixels wide and high: single ones fade where a page shows the picture smaller.
+        // Two pixels wide and high: single pixels fade where a page shows the picture smaller.
         let half = 0.5 / pixels_per_unit;
         for (dx, dy) in [(-half, -half), (-half, half), (half, -half), (half, half)] {
             if let Some(i) = pixel(px + dx, py + dy) {
@@ -157,7 +157,7 @@ fn draw(points: &[[f64; 3]], path: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> (Pict
             return GROUND;
         }
         let share = (sum / f64::from(count) - z[0]) / (z[1] - z[0]);
-        // A single point is already seen; more make it brighter.
+        // A single point is visible; more make it brighter.
         let bright = 1.0 - 0.65 * (-f64::from(count) / POINTS_FOR_BRIGHT).exp();
         let full =
             rainbow(LOWEST_COLOUR + (HIGHEST_COLOUR - LOWEST_COLOUR) * share.clamp(0.0, 1.0));
@@ -172,7 +172,7 @@ fn draw(points: &[[f64; 3]], path: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> (Pict
     (picture, WIDTH as f64 / pixels_per_unit)
 }
 
-/// A white stroke three pixels wide from one position to the next.
+/// Draws a white stroke three pixels wide from one position to the next.
 fn draw_step(
     picture: &mut Picture,
     step: &[[f64; 2]],
@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn points_and_way_are_seen_and_outliers_do_not_shrink_them() {
+    fn points_and_path_are_visible_and_outliers_do_not_shrink_them() {
         let mut cloud: Vec<SurfacePoint> = (0..5000)
             .map(|i| point((i % 100) as f32, (i / 500) as f32, (i / 100) as f32))
             .collect();
@@ -224,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn the_scale_bar_is_a_round_length_and_says_metres_where_they_are_known() {
+    fn the_scale_bar_has_a_round_length_and_metres_where_known() {
         let bar = scale_bar(6.2, "map units", Some(0.43));
         assert!(bar.contains("width:16.13%") && bar.contains(">1 map unit = 0.43 m<"), "{bar}");
         let bar = scale_bar(1300.0, "m", None);

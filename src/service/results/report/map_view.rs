@@ -1,4 +1,4 @@
-//! The 3D map in the report: the page's viewer with a thinned map in it, no other file needed.
+//! The 3D map in the report: the page's viewer with a thinned map in it, without any other file.
 
 use std::fmt::Write;
 
@@ -17,13 +17,13 @@ use crate::slam::trajectory::gaps_in;
 /// Most points of the map in a report: 3.2 MB of text, which a browser opens at once.
 const MAX_POINTS: usize = 300_000;
 
-/// The section; nothing without points.
+/// The section; empty without points.
 pub fn map_view(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
     let map = &results.record.map;
     let Some(first) = map.keyframes.first().filter(|_| !results.surface.is_empty()) else {
         return String::new();
     };
-    // Each epoch has a place and a unit of its own.
+    // Each epoch has a separate world and unit.
     let epoch = longest_epoch(results.record);
     let keyframes: Vec<SceneKeyframe> = map
         .keyframes
@@ -35,7 +35,7 @@ pub fn map_view(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
             place: k.map_from_keyframe,
         })
         .collect();
-    // Each is of the first keyframe that saw it.
+    // Each point belongs to the first keyframe that saw it.
     let scene_point = |&SurfacePoint { position, grey, sigma, .. }: &SurfacePoint| ScenePoint {
         position,
         grey,

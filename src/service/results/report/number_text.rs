@@ -11,7 +11,7 @@ pub(super) fn length(metres: f64) -> String {
     }
 }
 
-/// Without the zeros at the end behind the point, and without a point that nothing follows.
+/// Strips zeros at the end of the decimals, and a point without decimals.
 pub(crate) fn without_zeros(text: &str) -> &str {
     match text.contains('.') {
         true => text.trim_end_matches('0').trim_end_matches('.'),

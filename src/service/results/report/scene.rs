@@ -1,7 +1,7 @@
-//! A finished map as the 3D view of a page takes it: points grouped by keyframes, keyframes, trajectory, in one block of bytes.
+//! A finished map for the 3D view of a page: points by keyframe, keyframes and trajectory in one block of bytes.
 //!
-//! The block is the length of a JSON header (u32, little-endian), the header, and eight bytes a point: where it is in its
-//! cluster's box (three u16), its brightness and the code of its relative deviation.
+//! The block is the length of a JSON header (u32, little-endian), the header, and eight bytes per point: its position
+//! in its cluster's box (three u16), its brightness and the code of its relative deviation.
 
 use std::collections::HashMap;
 
@@ -11,7 +11,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::trajectory::StampedPose;
 
-/// The 3D view itself: plain WebGL, needs nothing else.
+/// The 3D view itself: plain WebGL without dependencies.
 pub const VIEWER: &str = include_str!("viewer.js");
 /// Its time slider.
 pub const PLAYER: &str = include_str!("player.js");
@@ -20,27 +20,27 @@ pub const PLAYER: &str = include_str!("player.js");
 pub const POINT_BYTES: usize = 8;
 /// Most poses of the trajectory: a line on a screen shows no more.
 const MAX_POSES: usize = 6000;
-/// Most keyframes that are asked which of them saw a point first: more cost seconds and move no point by much.
+/// Most keyframes that are checked for the first view of a point: more cost seconds and move no point by much.
 const MAX_ASKED: usize = 400;
-/// Furthest that a keyframe is taken to have seen a point, in its own units: its mean inverse depth is 1.
+/// Largest depth at which a keyframe is taken to have seen a point, in its own units: its mean inverse depth is 1.
 const FURTHEST: f64 = 4.0;
-/// Nearest, as well.
+/// Smallest such depth.
 const NEAREST: f64 = 0.1;
-/// A pause between poses that is a gap in the line: so many times the usual one.
+/// A pause between poses this many times the usual one is a gap in the line.
 const GAP_STEPS: f64 = 6.0;
-/// Relative deviations that the codes 1 and 255 stand for.
+/// Relative deviations of the codes 1 and 255.
 const DEVIATION_RANGE: [f64; 2] = [1e-3, 1.0];
 
 /// A point of the map.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ScenePoint {
-    /// Where it is, map units.
+    /// Its position, map units.
     pub position: [f32; 3],
     /// Its brightness.
     pub grey: u8,
-    /// Standard deviation along the ray, map units; NaN where it is not known.
+    /// Standard deviation along the ray, map units; NaN where it is unknown.
     pub std_dev: f32,
-    /// The keyframe that it is of; `None` for the first that saw it.
+    /// Its keyframe; `None` for the first that saw it.
     pub keyframe_id: Option<u64>,
 }
 
@@ -51,30 +51,30 @@ pub struct SceneKeyframe {
     pub keyframe_id: u64,
     /// Stamp of its frame, nanoseconds.
     pub nanos: i64,
-    /// Where the map has it.
+    /// Its pose in the map.
     pub place: Sim3,
 }
 
-/// What is packed.
+/// The input to be packed.
 #[derive(Debug, Clone, Copy)]
 pub struct SceneInput<'a> {
-    /// The points; any even part of them is a picture of all.
+    /// The points; any even part of them represents all.
     pub points: &'a [ScenePoint],
     /// The keyframes in order of their stamps.
     pub keyframes: &'a [SceneKeyframe],
     /// The trajectory.
     pub path: &'a [StampedPose],
-    /// Places in it before which the line has a gap, in ascending order; a pause is a gap too.
+    /// Indices in it before which the line has a gap, in ascending order; a pause is a gap too.
     pub gaps: &'a [usize],
     /// The camera.
     pub intrinsics: &'a Intrinsics,
-    /// What is above, where it is known; else the page takes what the cameras had above them.
+    /// The up direction, if it is known; else the page uses that of the cameras.
     pub up: Option<[f64; 3]>,
-    /// Points that are packed at most.
+    /// Most points that are packed.
     pub max_points: usize,
 }
 
-/// The code of a relative deviation: 0 where it is not known, else 1 to 255 on a logarithmic scale.
+/// The code of a relative deviation: 0 where it is unknown, else 1 to 255 on a logarithmic scale.
 pub fn deviation_code(relative: f64) -> u8 {
     let [low, high] = DEVIATION_RANGE;
     // NaN has no code.
@@ -84,7 +84,7 @@ pub fn deviation_code(relative: f64) -> u8 {
     (1.0 + 254.0 * ((relative / low).ln() / (high / low).ln()).clamp(0.0, 1.0)) as u8
 }
 
-/// The order in which `count` things stand so that the first of them are an even sample: steps of the golden ratio.
+/// An order of `count` items of which any beginning is an even sample: steps of the golden ratio.
 pub fn even_order(count: usize) -> impl Iterator<Item = usize> {
     const GOLDEN: f64 = 0.618_033_988_749_895;
     let gcd = |mut a: usize, mut b: usize| {
@@ -100,7 +100,7 @@ pub fn even_order(count: usize) -> impl Iterator<Item = usize> {
     (0..count).map(move |i| (i as u128 * step as u128 % count as u128) as usize)
 }
 
-/// The block of bytes.
+/// Packs the block of bytes.
 pub fn pack(input: &SceneInput<'_>) -> Vec<u8> {
     let first_keyframe = input.keyframes.first().map(|k| k.nanos);
     let start = input.path.first().map(|pose| pose.nanos).or(first_keyframe).unwrap_or(0);
@@ -129,7 +129,7 @@ pub fn pack(input: &SceneInput<'_>) -> Vec<u8> {
         "up": input.up,
         "end": path.last().and_then(|pose| pose[0].as_f64()).unwrap_or(0.0),
         "gap": gap(input.path) * every as f64,
-        // One that falls between two poses that are packed stands before the second.
+        // A gap between two packed poses is marked at the second.
         "gaps": input.gaps.iter().map(|place| place.div_ceil(every)).collect::<Vec<usize>>(),
         "points": input.points.len(),
         "shown": bytes.len() / POINT_BYTES,
@@ -153,19 +153,19 @@ pub fn framed(header: &Value, bytes: &[u8]) -> Vec<u8> {
     block
 }
 
-/// Seven significant digits are more than a screen shows.
+/// Six decimals are more than a screen shows.
 fn rounded(number: f64) -> f64 {
     if number.is_finite() { (number * 1e6).round() / 1e6 } else { 0.0 }
 }
 
-/// A place as seven numbers and its unit.
+/// A similarity as the seven numbers of its pose, and its scale.
 pub fn place_numbers(place: &Sim3) -> [f64; 8] {
     let [qx, qy, qz, qw] = place.rigid.quaternion_xyzw();
     let t = &place.rigid.translation;
     [t.x, t.y, t.z, qx, qy, qz, qw, place.scale]
 }
 
-/// The pause between two poses from which on the line has a gap, seconds.
+/// The shortest pause between two poses that is a gap in the line, seconds.
 fn gap(path: &[StampedPose]) -> f64 {
     let mut steps: Vec<i64> = path.windows(2).map(|pair| pair[1].nanos - pair[0].nanos).collect();
     steps.sort_unstable();
@@ -188,7 +188,7 @@ fn group<'a>(input: &SceneInput<'a>) -> Vec<Vec<&'a ScenePoint>> {
         }
         let of = match point.keyframe_id {
             Some(id) => index.get(&id).copied(),
-            // One that nobody is known to have seen belongs to the last: it is there in the end.
+            // A point without a known viewer belongs to the last keyframe: it exists in the end.
             None => first_viewer(&views, input.intrinsics, point).or(groups.len().checked_sub(1)),
         };
         if let Some(group) = of {
@@ -198,8 +198,8 @@ fn group<'a>(input: &SceneInput<'a>) -> Vec<Vec<&'a ScenePoint>> {
     groups
 }
 
-/// The first of some keyframes (`keyframe_from_map`, each with its place in the list) that had a point in its image, not
-/// too far away; else the first that had it in its image at all.
+/// The first of some keyframes (`keyframe_from_map`, each with its index) that had a point in its image and not too far
+/// away; else the first that had it in its image at all.
 fn first_viewer(views: &[(usize, Sim3)], k: &Intrinsics, point: &ScenePoint) -> Option<usize> {
     let position = nalgebra::Vector3::from(point.position.map(f64::from));
     let mut far = None;
@@ -244,7 +244,7 @@ fn cluster(
     let keyframe_from_map = keyframe.place.inverse();
     let mut inverse_depths = Vec::with_capacity(points.len());
     let offset = bytes.len();
-    // Fused points come in an order of which any beginning is a picture of all; those of one keyframe row by row.
+    // Fused points are in an order of which any beginning represents all; those of one keyframe are row by row.
     let is_ordered = points.first().is_some_and(|point| point.keyframe_id.is_none());
     let mut push = |point: &ScenePoint| {
         for axis in 0..3 {
@@ -314,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn a_point_comes_back_to_a_hundred_thousandth_of_its_box() {
+    fn a_point_is_restored_to_a_hundred_thousandth_of_its_box() {
         let block =
             pack_points(&[point(0.0, Some(5)), point(1.0, Some(5)), point(0.25, Some(5))], 10);
         let (header, bytes) = unpack(&block);
@@ -332,7 +332,7 @@ mod tests {
 
     #[test]
     fn a_standard_deviation_is_a_share_of_the_distance_along_the_ray() {
-        // As far aside as it is deep, in a keyframe whose unit is two of the map's.
+        // As far to the side as it is deep, in a keyframe whose unit is two of the map's.
         let block = pack_points(&[point(2.0, Some(3))], 10);
         let (_, bytes) = unpack(&block);
         let (distance, depth) = (8.0f64.sqrt(), 2.0);
@@ -350,7 +350,7 @@ mod tests {
     }
 
     #[test]
-    fn a_large_map_is_thinned_evenly_and_nothing_that_is_no_number_is_packed() {
+    fn a_large_map_is_thinned_evenly_and_non_finite_points_are_left_out() {
         let mut points: Vec<ScenePoint> =
             (0..1000).map(|i| point(i as f32 * 1e-3, Some(3))).collect();
         points[0].position[1] = f32::NAN;
@@ -364,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gap_of_the_path_stays_where_the_path_is_thinned() {
+    fn a_gap_in_the_path_survives_thinning() {
         let pose =
             |i: i64| StampedPose { nanos: i * 33_333_333, world_from_camera: SE3::identity() };
         for (count, places) in [(6000, [1, 2999]), (18_000, [1, 1000])] {
@@ -383,7 +383,7 @@ mod tests {
     }
 
     #[test]
-    fn the_order_is_a_permutation_and_codes_rise() {
+    fn the_order_is_a_permutation_and_codes_increase() {
         for count in [0, 1, 2, 7, 100, 1001] {
             let mut order: Vec<usize> = even_order(count).collect();
             order.sort_unstable();

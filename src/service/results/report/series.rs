@@ -1,4 +1,4 @@
-//! Points of a chart that are drawn in one way.
+//! Points of a chart that are drawn in one style.
 
 /// How the points of a series are drawn.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -7,17 +7,17 @@ pub enum Mark {
     Line,
     /// A line in any direction.
     Path,
-    /// A broken line in any direction.
+    /// A dashed line in any direction.
     DashedPath,
     /// Dots of this radius.
     Dots(f64),
     /// Bars from zero, of this width in x.
     Bars(f64),
-    /// A vertical line through all of the plot at each x.
+    /// A vertical line across the plot at each x.
     Rule,
 }
 
-/// Points drawn in one way.
+/// Points drawn in one style.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Series {
     /// Name in the legend; an empty one has no entry.
@@ -31,7 +31,7 @@ pub struct Series {
 }
 
 impl Series {
-    /// Points with a name and a colour, drawn as `mark` says.
+    /// Points with a name and a colour, drawn as `mark`.
     pub fn new(
         name: &'static str,
         colour: &'static str,

@@ -1,4 +1,4 @@
-//! Directions in which a trajectory is looked at: from above and from the side.
+//! Viewing directions of a trajectory: from above and from the side.
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 
@@ -8,7 +8,7 @@ use crate::slam::up::up_direction;
 /// Orthonormal directions of a drawing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Views {
-    /// Along which the trajectory extends most, level.
+    /// Level, along the largest extent of the trajectory.
     right: Vector3<f64>,
     /// Level, into the side view.
     forward: Vector3<f64>,
@@ -17,21 +17,21 @@ pub struct Views {
 }
 
 impl Views {
-    /// Directions for these poses, with what is `up` where that is known; else what the cameras have above them on
-    /// average. Cameras that do not agree on that (one that looks straight down may turn freely) are shown by the extent
-    /// of their path alone.
+    /// Directions for these poses, with `up` if it is known, else with the mean up direction of the cameras. Where the
+    /// cameras do not agree on one (a camera that looks straight down may turn freely) only the extent of their path is
+    /// used.
     pub fn of(poses: &[StampedPose], up: Option<Vector3<f64>>) -> Self {
         let extent = extent_axes(poses);
         let up = up.or_else(|| up_direction(poses.iter(), std::iter::empty()));
         let up = up.unwrap_or(extent[2]);
         let level = |axis: &Vector3<f64>| axis - up * up.dot(axis);
-        // Of the extent's axes at most one is along `up`; the largest that is not gives the width.
+        // At most one of the extent's axes is along `up`; the largest other one gives the width.
         let right = extent.iter().map(level).find(|axis| axis.norm() > 0.5);
         let right = right.map_or_else(Vector3::x, |axis| axis.normalize());
         Self { right, forward: up.cross(&right), up }
     }
 
-    /// The same views of a frame that is turned against this one.
+    /// The same views in a coordinate frame that is turned against this one.
     pub fn turned(self, rotation: &UnitQuaternion<f64>) -> Self {
         let [right, forward, up] = [self.right, self.forward, self.up].map(|axis| rotation * axis);
         Self { right, forward, up }
