@@ -1,4 +1,4 @@
-//! Frames in: dataset readers, simulator, cameras. The only place that names image files and video devices.
+//! Sources of frames: dataset readers, simulator, cameras. The only module that names image files and video devices.
 
 pub(crate) mod bag;
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! The command line: arguments → configuration → shell → exit code.
 //!
-//! Exit codes: 0 done, 1 failed (one line says what, where and what to do), 2 the command line is
-//! not understood, 3 nothing was tracked (one line says why), 130 interrupted (results so far are written).
+//! Exit codes: 0 done, 1 failed (one line states what, where and what to do), 2 the command line is invalid, 3 nothing
+//! was tracked (one line gives the reason), 130 interrupted (results so far are written).
 
 pub(crate) mod bench;
 pub(crate) mod bridge;
@@ -49,19 +49,19 @@ use crate::service::error_log::ErrorLog;
 use crate::wire::limits::check_address_space;
 use crate::wire::place::Place;
 
-/// Exit code of a run that was interrupted: 128 + SIGINT, as shells have it.
+/// Exit code of an interrupted run: 128 + SIGINT, as in shells.
 const INTERRUPTED: u8 = 130;
 
 /// Exit code of a run that has tracked nothing.
 const NOTHING_TRACKED: u8 = 3;
 
-/// How long the end of a command waits for its log to be written.
+/// Longest wait at the end of a command for its log to be written.
 const LAST_LINES: Duration = Duration::from_secs(1);
 
 /// Heading of the options that every command has.
 const COMMON: &str = "Common options";
 
-/// What a command may fail with: one line for the user.
+/// Result of a command; its error is one line for the user.
 pub type CommandResult = Result<ExitCode, Box<dyn Error>>;
 
 #[derive(Debug, Parser)]
@@ -115,24 +115,24 @@ pub enum LogFormat {
 }
 
 impl CommonArguments {
-    /// Configuration with everything that was said on the command line.
+    /// Loads the configuration, including the settings on the command line.
     fn load(&self) -> Result<Config, ConfigError> {
         Config::load(self.file().as_deref(), &self.settings())
     }
 
-    /// What the command line sets, as `--set` does.
+    /// Settings on the command line, in the form of `--set`.
     fn settings(&self) -> Vec<String> {
         let named = self.instance.iter().map(|name| format!("instance={name:?}"));
         self.set.iter().cloned().chain(named).collect()
     }
 
-    /// The configuration file: the one that is named, else the usual one.
+    /// The configuration file: the named one, else the default one.
     fn file(&self) -> Option<PathBuf> {
         let usual = || file_for(Path::new(SYSTEM_FOLDER), self.instance.as_deref());
         self.config.clone().or_else(usual)
     }
 
-    /// The same options but for the instance.
+    /// The same options without the instance.
     fn without_instance(&self) -> Self {
         Self { config: self.file(), instance: None, ..self.clone() }
     }
@@ -147,7 +147,7 @@ impl CommonArguments {
         arguments
     }
 
-    /// Those of them that `semidense-bridge` has too.
+    /// Those options that `semidense-bridge` also has.
     fn of_bridge(&self) -> Vec<OsString> {
         let mut arguments: Vec<OsString> = Vec::new();
         let mut push =
@@ -185,7 +185,7 @@ enum Subcommands {
     Zenoh(bridge::BridgeArguments),
 }
 
-/// The command line as `clap` knows it: what man page and shell completions are made of.
+/// The command line as a `clap` command, from which man page and shell completions are generated.
 pub fn command_line() -> clap::Command {
     CommandLine::command()
 }
@@ -201,7 +201,7 @@ pub fn main() -> ExitCode {
         }
     };
     let outcome = run_subcommand(line, &log);
-    // What is said last comes after the log.
+    // Waits so that the final messages follow the log.
     log.wait_written(LAST_LINES);
     if log.dropped_lines() > 0 {
         let dropped = log.dropped_lines();
@@ -257,8 +257,8 @@ fn run_subcommand(line: CommandLine, log: &ErrorLog) -> CommandResult {
     outcome
 }
 
-/// The filter of `--log`. A word alone must be a level: the filter's own reader takes every other word
-/// for the name of a module, and then nothing of the program is logged.
+/// Parses the filter of `--log`. A single word must be a level: the filter's own parser takes every other word for the
+/// name of a module, and then nothing of the program is logged.
 fn log_filter(text: &str) -> Result<EnvFilter, String> {
     const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
     let form =
@@ -273,7 +273,7 @@ fn log_filter(text: &str) -> Result<EnvFilter, String> {
     EnvFilter::try_new(text).map_err(|error| format!("--log {text}: {error}; {form}"))
 }
 
-/// Spans are logged as they end, with the time that they took, where the level shows them.
+/// Starts the log. Spans are logged when they end, with their duration, if the level includes them.
 fn start_log(filter: EnvFilter, format: LogFormat, log: &ErrorLog) -> Result<(), Box<dyn Error>> {
     let lines = tracing_subscriber::fmt::layer()
         .with_writer(log.clone())
@@ -308,7 +308,7 @@ mod tests {
     use super::log_filter;
 
     #[test]
-    fn a_log_level_is_a_level() {
+    fn only_levels_are_accepted_as_log_levels() {
         for good in ["warn", "INFO", "off", "warn,semidense::service=debug", "semidense=trace"] {
             assert!(log_filter(good).is_ok(), "{good}");
         }

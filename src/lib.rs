@@ -2,8 +2,8 @@
 //!
 //! # Three ways to use it
 //!
-//! **The algorithm, in your own program.** Images in, poses and a map out, on your thread; needs none of the default
-//! features. See [`Odometry`]:
+//! **The algorithm, in your own program.** Images in, poses and a map out, on your thread; none of the default features
+//! is needed. See [`Odometry`]:
 //!
 //! ```
 //! use semidense::{FrameView, Intrinsics, Odometry, OdometryParams};
@@ -21,25 +21,25 @@
 //! **The topics of a running instance**, from any process of the same user: [`reader`] (feature `service`).
 //!
 //! **The program itself**, `semidense run`, `replay` and the processes that systemd starts: [`command`] is its command
-//! line, one short file a subcommand, and [`service`] what runs behind it (feature `service`).
+//! line, one short file per subcommand, and [`service`] the processes behind it (feature `service`).
 //!
 //! # Layout
 //!
-//! Imports run down: [`command`] → [`service`] → [`slam`], [`wire`], [`capture`].
+//! Dependencies point one way: [`command`] → [`service`] → [`slam`], [`wire`], [`capture`].
 //! * [`slam`] is pure: images and poses in, poses and depth out; no clock, thread, I/O or log.
-//! * [`capture`] brings frames in: dataset readers, the simulator, cameras.
-//! * [`wire`] is shared memory: the only place that names iceoryx2. [`reader`] reads it.
-//! * [`service`] is the process shells: clock, threads, configuration, health, results.
+//! * [`capture`] provides the frames: dataset readers, the simulator, cameras.
+//! * [`wire`] is the shared memory between the processes and the only module that names iceoryx2; [`reader`] reads it.
+//! * [`service`] holds the process shells: clock, threads, configuration, health, results.
 //! * [`command`] is the command line.
 //!
 //! # Features
 //!
-//! | feature | what | default |
+//! | feature | contents | default |
 //! |---|---|---|
 //! | `service` | processes, topics, results, the program; needs `cameras` | yes |
-//! | `cameras` | where frames come from: cameras, recordings, the simulator | yes |
+//! | `cameras` | sources of frames: cameras, recordings, the simulator | yes |
 //!
-//! Without them (`default-features = false`) the algorithm builds with nalgebra, rayon, serde and thiserror alone.
+//! Without them (`default-features = false`) the algorithm needs only nalgebra, rayon, serde and thiserror.
 
 #[cfg(feature = "cameras")]
 pub mod capture;

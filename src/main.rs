@@ -1,4 +1,4 @@
-//! The one binary: hands the command line to `command` and returns its exit code.
+//! The program: passes the command line to `command` and returns its exit code.
 
 use std::process::ExitCode;
 

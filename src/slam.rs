@@ -1,7 +1,7 @@
 //! The pure part: images and poses in, poses and depth out. No I/O, clock, thread or log.
 //!
-//! [`tracker`] is the recipe of a frame, [`mapper`] the recipe of a map step; both stand on
-//! [`geometry`], [`image`], [`alignment`] and [`depth`].
+//! [`tracker`] tracks a frame, [`mapper`] performs a map step; both build on [`geometry`], [`image`], [`alignment`] and
+//! [`depth`].
 
 pub mod alignment;
 pub(crate) mod counted;

@@ -1,7 +1,7 @@
-//! Shared memory: the only place that names iceoryx2.
+//! Shared memory between the processes; the only module that names iceoryx2.
 //!
-//! [`message`] are the bytes, [`conversion`] checks them, [`topic`] is the table of who sends what,
-//! [`place`] says where an instance lives, [`port`] sends, receives and waits, [`command`] asks.
+//! [`message`] defines the bytes, [`conversion`] checks them, [`topic`] lists every topic with its publisher, [`place`]
+//! is where an instance lives, [`port`] sends, receives and waits, [`command`] carries requests to the mapper.
 
 pub mod command;
 pub mod conversion;

@@ -1,7 +1,7 @@
-//! ROS 2 bags and our own recordings, in MCAP files: one topic of images as a source of frames.
+//! ROS 2 bags and our own recordings, in MCAP files: one topic of images as a frame source.
 //!
-//! Read once from the start, message by message, so that a file without end (of a recorder that was killed) is played to
-//! the last whole chunk. Sizes in the file are never trusted.
+//! Read once from the start, message by message, so that a file without an end (from a killed recorder) is played up to
+//! its last complete chunk. Sizes in the file are never trusted.
 
 pub mod bag_error;
 mod camera;
@@ -29,25 +29,25 @@ use crate::capture::source::{FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
-/// The images of a topic as a source of frames.
+/// A topic's images as a frame source.
 #[derive(Debug)]
 pub struct Bag {
     path: PathBuf,
     contents: Contents,
     records: Records,
     rectifier: Rectifier,
-    /// What our own recording says of the next image.
+    /// Our own recording's record of the next image.
     record: Option<FrameRecord>,
     /// The source's number of the first frame.
     first_sequence: Option<u64>,
-    /// Number that a frame without one of its own gets.
+    /// Sequence of the next frame unless its record has one.
     next: u64,
-    /// Stamp of the frame before.
+    /// Stamp of the previous frame.
     last_nanos: Option<i64>,
     notice: Option<Notice>,
 }
 
-/// Opens the images on `topic`, or on the only topic that has some. Without `rig` the `CameraInfo` beside them serves.
+/// Opens the images on `topic`, or on the only topic with images. Without `rig`, the `CameraInfo` next to them is used.
 pub fn open(path: &Path, topic: Option<&str>, rig: Option<&Path>) -> Result<Bag, SourceError> {
     let bag = |problem| SourceError::Bag { path: path.to_owned(), problem };
     let contents = Contents::read(path, topic).map_err(bag)?;
@@ -74,7 +74,7 @@ pub fn open(path: &Path, topic: Option<&str>, rig: Option<&Path>) -> Result<Bag,
 }
 
 impl Bag {
-    /// Continues to the next image; gives its stamp. `None` after the last.
+    /// Advances to the next image and returns its stamp; `None` after the last.
     fn advance(&mut self) -> Result<Option<FrameStamp>, SourceError> {
         loop {
             let place = match self.records.advance() {
@@ -98,8 +98,8 @@ impl Bag {
         }
     }
 
-    /// The stamp of an image whose header has `stamp`: our own recording's, where it says; that of the header; where
-    /// that was never set, when it was recorded.
+    /// Returns the stamp of an image whose header has `stamp`: that of our own recording, if it has one, else that of
+    /// the header, or the time of recording if the header's was never set.
     fn stamp(
         &mut self,
         stamp: Result<i64, message::CdrError>,
@@ -113,7 +113,7 @@ impl Bag {
             Some(own) => {
                 let first = *self.first_sequence.get_or_insert(own.sequence);
                 FrameStamp {
-                    // A damaged number must not go back.
+                    // A damaged number must not go backwards.
                     sequence: own.sequence.saturating_sub(first).max(sequence),
                     capture_nanos: own.capture_nanos,
                     exposure_nanos: own.exposure_nanos,
@@ -141,7 +141,7 @@ impl Bag {
         SourceError::BagImage { path, topic, problem }
     }
 
-    /// Decodes the image at hand into `pixels`.
+    /// Decodes the current image into `pixels`.
     fn decode_into(&mut self, pixels: &mut [u8]) -> Result<(), BagImageError> {
         let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
         let data = self.records.message();

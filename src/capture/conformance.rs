@@ -1,4 +1,4 @@
-//! Every source against the contract of [`FrameSource`], and what the readers say of bad input.
+//! Tests every source against the contract of [`FrameSource`], and the readers' errors for bad input.
 
 use std::fs;
 use std::path::Path;
@@ -33,12 +33,12 @@ distortion_model: radial-tangential
 distortion_coefficients: [-0.1, 0.02, 0.0, 0.0]
 ";
 
-/// A level that names the frame; JPEG and PNG keep it.
+/// A grey level that identifies the frame; JPEG and PNG preserve it.
 fn level(frame: usize) -> u8 {
     (40 + 20 * frame) as u8
 }
 
-/// Images of one level each, alternating PNG and JPEG, all called `.png`.
+/// Writes an image of one level, alternating between PNG and JPEG, always called `.png`.
 fn write_image(path: &Path, frame: usize) {
     if frame.is_multiple_of(2) {
         write_gray_png(path, WIDTH, HEIGHT, &[level(frame); WIDTH * HEIGHT]).expect("written");
@@ -127,7 +127,7 @@ fn open(name: &SourceName, rig: Option<&Path>) -> Result<Box<dyn FrameSource>, S
     opening::open(name, rig, &SourceParams { simulator, ..SourceParams::default() })
 }
 
-/// Makes a dataset, lets `spoil` change it and opens it.
+/// Creates a dataset, lets `spoil` change it and opens it.
 fn opened(
     kind: &str,
     spoil: impl FnOnce(&Path),
@@ -196,7 +196,7 @@ fn every_source_keeps_the_contract() {
 }
 
 #[test]
-fn frames_can_be_left_out_up_to_a_sequence() {
+fn frames_up_to_a_sequence_can_be_skipped() {
     for kind in ["tum", "euroc", "images", "mcap", "sim"] {
         for (sequence, expected) in
             [(0, vec![1, 2, 3, 4]), (2, vec![3, 4]), (4, vec![]), (99, vec![])]
@@ -251,7 +251,7 @@ fn depth_belongs_to_the_nearest_frame_within_20_ms() {
         let expected = (stamp.sequence % 2 == 0).then_some(1.0 + stamp.sequence as f32);
         assert_eq!(metres, expected, "frame {}", stamp.sequence);
     }
-    // The first depth image stands at 15 ms.
+    // The first depth image is stamped 15 ms.
     let first = 1_000_000_000_000_000_000;
     assert!(source.depth_at(first + 35_000_000).expect("readable").is_some());
     assert!(source.depth_at(first + 35_000_001).expect("readable").is_none());
@@ -259,7 +259,7 @@ fn depth_belongs_to_the_nearest_frame_within_20_ms() {
 }
 
 #[test]
-fn euroc_truth_is_moved_from_the_body_to_the_camera() {
+fn euroc_truth_is_transformed_from_the_body_to_the_camera() {
     let (_folder, source) = opened("euroc", |_| {});
     let source = source.expect("valid");
     let pose = source.ground_truth()[3];
@@ -291,7 +291,7 @@ fn stamps_of_an_image_folder_come_from_its_times() {
 }
 
 #[test]
-fn a_named_rig_wins_over_the_recordings_own() {
+fn a_named_rig_overrides_the_recordings_own() {
     for kind in ["tum", "euroc"] {
         let (folder, own) = opened(kind, |_| {});
         let rig = folder.path().join("rig.toml");
@@ -307,7 +307,7 @@ fn a_named_rig_wins_over_the_recordings_own() {
 const CAM: &str = "mav0/cam0/data.csv";
 const TRUTH: &str = "mav0/state_groundtruth_estimate0/data.csv";
 
-/// Layout, file, what is replaced in it by what, and what is said of that.
+/// Layout, file, the text replaced in it, its replacement, and the expected error.
 const BAD_RECORDINGS: &[(&str, &str, &str, &str, &str)] = &[
     ("tum", "rgb.txt", "000.10", "000.01", "rgb.txt, line 4: has an earlier time stamp"),
     ("tum", "rgb.txt", "000.10", "000.05", "rgb.txt, line 4: has the same time stamp"),
@@ -353,7 +353,7 @@ fn a_bad_recording_is_one_clear_line() {
 }
 
 #[test]
-fn what_is_missing_is_named() {
+fn missing_files_and_entries_are_named() {
     for (kind, file, text, expected) in [
         ("tum", "rgb.txt", None, "rgb.txt: cannot be read"),
         ("tum", "rgb.txt", Some("# nothing\n"), "rgb.txt: has no frames"),

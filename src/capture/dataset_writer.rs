@@ -1,7 +1,6 @@
 //! Writes a sequence as a dataset in the layout of TUM RGB-D or EuRoC, with depth and poses.
 //!
-//! Everything is written into a folder beside the target, which takes the target's place when all
-//! of it is there.
+//! All files are written to a folder next to the target, which replaces the target once it is complete.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
@@ -17,7 +16,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::trajectory::StampedPose;
 
-/// Where the files of a dataset lie and what they are called.
+/// Where the files of a dataset are and how they are named.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DatasetLayout {
     /// `rgb/`, `depth/`, `rgb.txt`, `depth.txt`, `groundtruth.txt`, `camera.txt`.
@@ -29,19 +28,19 @@ pub enum DatasetLayout {
 /// Why a dataset cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub enum DatasetError {
-    /// There is something at the target that would be lost.
+    /// The target holds files that would be lost.
     #[error("{}: is not empty; name another folder, or replace the dataset with --force", folder.display())]
     NotEmpty {
         /// The target.
         folder: PathBuf,
     },
-    /// What would be replaced does not look like a dataset.
+    /// The folder to be replaced does not look like a dataset.
     #[error("{}: is not a dataset, so it is not replaced; name another folder", folder.display())]
     NotADataset {
         /// The target.
         folder: PathBuf,
     },
-    /// TUM's `camera.txt` and EuRoC's `sensor.yaml` have no such lens.
+    /// TUM's `camera.txt` and EuRoC's `sensor.yaml` cannot describe such a lens.
     #[error("the layout has no equidistant lens; write the dataset with a radtan lens")]
     Lens,
     /// A file or folder cannot be written.
@@ -49,7 +48,7 @@ pub enum DatasetError {
     Write {
         /// The file or folder.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
     /// An image cannot be written.
@@ -57,8 +56,8 @@ pub enum DatasetError {
     Image(#[from] ImageFileError),
 }
 
-/// A dataset being written; [`DatasetWriter::finish`] puts it in its place, dropping it before
-/// removes what was written.
+/// A dataset being written; [`DatasetWriter::finish`] moves it into place, dropping it earlier removes what was
+/// written.
 #[derive(Debug)]
 pub struct DatasetWriter {
     layout: DatasetLayout,
@@ -69,8 +68,8 @@ pub struct DatasetWriter {
     is_finished: bool,
 }
 
-/// Pose of the camera on the body of a EuRoC dataset: the optical axis along the body's x, the
-/// image's right along −y, and a lever, so that a reader which forgets it is found out.
+/// Pose of the camera on the body of a EuRoC dataset: the optical axis along the body's x, the image's right along −y,
+/// and a lever arm, so that a reader that ignores it is detected.
 fn body_from_camera() -> SE3 {
     let axes = Matrix3::new(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0);
     SE3 {
@@ -80,8 +79,8 @@ fn body_from_camera() -> SE3 {
 }
 
 impl DatasetWriter {
-    /// Starts a dataset of raw images of `camera` that will stand at `target`. A target that is not
-    /// empty is refused; with `replace` a dataset there is replaced, anything else still refused.
+    /// Starts a dataset of raw images of `camera` that will be placed at `target`. A target that is not empty is
+    /// refused; with `replace` an existing dataset is replaced, anything else still refused.
     pub fn create(
         target: &Path,
         layout: DatasetLayout,
@@ -107,8 +106,8 @@ impl DatasetWriter {
         Ok(writer)
     }
 
-    /// Writes the raw image and depth (metres, 0 where none) of one frame. May be called from
-    /// several threads. Depths beyond 13 m do not fit 16 bits and are written as none.
+    /// Writes the raw image and depth (metres, 0 where none) of one frame. May be called from several threads. Depths
+    /// beyond 13 m do not fit 16 bits and are written as 0.
     pub fn write_frame(
         &self,
         nanos: i64,
@@ -123,7 +122,7 @@ impl DatasetWriter {
         Ok(write_depth_png(&depth_path, width, height, &steps)?)
     }
 
-    /// Writes lists, calibration and the poses of all frames, and puts the dataset in its place.
+    /// Writes lists, calibration and the poses of all frames, and moves the dataset into place.
     pub fn finish(mut self, ground_truth: &[StampedPose]) -> Result<(), DatasetError> {
         match self.layout {
             DatasetLayout::Tum => self.write_tum_lists(ground_truth)?,
@@ -136,14 +135,14 @@ impl DatasetWriter {
 
     fn take_place(&self) -> Result<(), DatasetError> {
         let old = beside(&self.target, "old");
-        // A check again: rendering takes time, and a folder filled meanwhile stays untouched.
+        // Checked again: rendering takes time, and a folder filled meanwhile stays untouched.
         let had_one = is_dataset(&self.target);
         if had_one {
             fs::rename(&self.target, &old).map_err(failed(&old))?;
         }
         if let Err(source) = fs::rename(&self.partial, &self.target) {
             if had_one {
-                // Back to where it was; the error that matters is the first one.
+                // Restores the old dataset; the error that matters is the first one.
                 let _ = fs::rename(&old, &self.target);
             }
             return Err(DatasetError::Write { path: self.target.clone(), source });
@@ -151,7 +150,7 @@ impl DatasetWriter {
         if had_one { fs::remove_dir_all(&old).map_err(failed(&old)) } else { Ok(()) }
     }
 
-    /// Where the images and the depth images are written.
+    /// Folders of the images and of the depth images.
     fn folders(&self) -> [PathBuf; 2] {
         let folders = match self.layout {
             DatasetLayout::Tum => ["rgb", "depth"],
@@ -257,7 +256,7 @@ impl DatasetWriter {
 impl Drop for DatasetWriter {
     fn drop(&mut self) {
         if !self.is_finished {
-            // Nobody is left to tell; a folder named .partial says what it is.
+            // The error cannot be reported here; the name .partial explains a folder that remains.
             let _ = fs::remove_dir_all(&self.partial);
         }
     }
@@ -288,7 +287,7 @@ fn write_euroc_states(file: &mut impl Write, poses: &[StampedPose]) -> io::Resul
     Ok(())
 }
 
-/// Refuses a target that holds something other than what may be replaced.
+/// Refuses a target that holds anything that may not be replaced.
 fn check_target(target: &Path, replace: bool) -> Result<(), DatasetError> {
     let entries = match fs::read_dir(target) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
@@ -310,7 +309,7 @@ fn is_dataset(folder: &Path) -> bool {
     folder.join("rgb.txt").is_file() || folder.join("mav0/cam0/data.csv").is_file()
 }
 
-/// A hidden name next to `target`, of this process alone.
+/// A hidden name next to `target`, unique to this process.
 fn beside(target: &Path, what: &str) -> PathBuf {
     let name = target.file_name().unwrap_or_default().to_string_lossy();
     target.with_file_name(format!(".{name}.{}.{what}", std::process::id()))
@@ -321,7 +320,7 @@ fn failed(path: &Path) -> impl FnOnce(io::Error) -> DatasetError {
     move |source| DatasetError::Write { path, source }
 }
 
-/// A depth in steps of the 16-bit image, 0 where there is none or it does not fit.
+/// Converts a depth to steps of the 16-bit image, 0 if there is none or it does not fit.
 fn depth_steps(depth_m: f32) -> u16 {
     let steps = (depth_m * DEPTH_STEPS_PER_METRE).round();
     if steps > 0.0 && steps <= f32::from(u16::MAX) { steps as u16 } else { 0 }

@@ -1,12 +1,12 @@
-//! What can be wrong with the bytes of an image, of any format.
+//! Errors in the bytes of an image of any format.
 
-/// Largest width and height of an image, pixels; more is a broken header, not a camera.
+/// Largest width and height of an image, pixels; more indicates a broken header, not a camera.
 pub const MAX_SIDE: usize = 8192;
 
-/// What is wrong with the bytes of an image.
+/// Why the bytes of an image cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum DecodeError {
-    /// Not a single byte.
+    /// No bytes.
     #[error("is empty; copy the file again or remove it from the sequence")]
     Empty,
     /// Neither PNG nor JPEG.
@@ -18,12 +18,12 @@ pub enum DecodeError {
     /// Truncated or corrupt.
     #[error("is a damaged {format} ({reason}); copy the file again or remove it from the sequence")]
     Damaged {
-        /// The format that its first bytes name.
+        /// The format indicated by its first bytes.
         format: &'static str,
-        /// What the decoder met.
+        /// The decoder's error.
         reason: String,
     },
-    /// Another size than the camera's.
+    /// A size other than the camera's.
     #[error(
         "is {}x{} pixels where the rig says {}x{}; use the rig this sequence was recorded with",
         found.0, found.1, expected.0, expected.1
@@ -34,12 +34,12 @@ pub enum DecodeError {
         /// Width and height of the rig.
         expected: (usize, usize),
     },
-    /// Another kind of samples than needed.
+    /// Samples of another kind than needed.
     #[error("holds {found} where {expected} is needed; export it again in that format")]
     Samples {
         /// Colour type and bit depth in the file.
         found: String,
-        /// What is needed.
+        /// The kind needed.
         expected: &'static str,
     },
 }

@@ -10,12 +10,12 @@ use crate::capture::source_error::SourceError;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::trajectory::StampedPose;
 
-/// Lens and mounting of the camera, below the recording's folder.
+/// File with lens and mounting of the camera, below the recording's folder.
 const SENSOR_FILE: &str = "cam0/sensor.yaml";
 
-/// Opens the recording in `folder`, which is `mav0` or holds it. The lens is that of
-/// `cam0/sensor.yaml` unless `rig` names another. The ground truth may be missing; it is the
-/// body's and is moved to the camera by the `T_BS` of `sensor.yaml`.
+/// Opens the recording in `folder`, which is `mav0` or contains it. The lens is that of `cam0/sensor.yaml` unless `rig`
+/// names another. The ground truth may be missing; it is the body's and is transformed to the camera by the `T_BS` of
+/// `sensor.yaml`.
 pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError> {
     let root = root_of(folder);
     let frame_list = frame_list(folder);
@@ -23,7 +23,7 @@ pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError>
     let sensor_path = root.join(SENSOR_FILE);
     let pose_list = root.join("state_groundtruth_estimate0/data.csv");
     let has_truth = pose_list.exists();
-    // With a rig of its own and no ground truth, nothing of the sensor's file is needed.
+    // With a separate rig and no ground truth, the sensor's file is not needed.
     let sensor = match rig {
         Some(_) if !has_truth => None,
         _ => Some(sensor_yaml::read(&sensor_path)?),
@@ -40,7 +40,7 @@ pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError>
     Recording::new(contents, &rig, rig_path, frame_list)
 }
 
-/// The list of the images of the recording in `folder`.
+/// Path of the image list of the recording in `folder`.
 pub(super) fn frame_list(folder: &Path) -> PathBuf {
     root_of(folder).join("cam0/data.csv")
 }
@@ -50,15 +50,15 @@ fn root_of(folder: &Path) -> PathBuf {
     if inner.is_dir() { inner } else { folder.to_owned() }
 }
 
-/// The camera of the recording's own `sensor.yaml`, and where that is; `None` where there is none.
+/// Returns the camera of the recording's own `sensor.yaml` and the path of that file; `None` if it cannot be read.
 pub fn own_rig(folder: &Path) -> Option<(Rig, PathBuf)> {
     let path = root_of(folder).join(SENSOR_FILE);
     Some((sensor_yaml::read(&path).ok()?.rig, path))
 }
 
-/// The camera's `sensor.yaml` that a recording has beside the folder of `pose_list`, where there is one.
+/// Path of the camera's `sensor.yaml` next to the folder of `pose_list`, if it exists.
 pub fn sensor_beside(pose_list: &Path) -> Option<PathBuf> {
-    // A bare file name lies in a folder too.
+    // A bare file name is in a folder too.
     let pose_list = pose_list.canonicalize().ok()?;
     Some(pose_list.parent()?.parent()?.join(SENSOR_FILE)).filter(|path| path.is_file())
 }
@@ -74,7 +74,7 @@ fn read_frames(images: &Path, list: &Path) -> Result<Vec<ListedImage>, SourceErr
     })
 }
 
-/// Reads the body's poses, `timestamp, p x y z, q w x y z` and more, as the camera's.
+/// Reads the body's poses, `timestamp, p x y z, q w x y z` and more, and returns the camera's.
 fn read_truth(list: &Path, body_from_camera: &SE3) -> Result<Vec<StampedPose>, SourceError> {
     read_list(list, |row| {
         let fields: Vec<&str> = row.text.split(',').map(str::trim).collect();

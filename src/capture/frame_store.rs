@@ -1,5 +1,5 @@
-//! Frames that were prepared before they are needed: in memory, or in a file that outlives the process, so that
-//! a capture which takes the place of one that was killed does not prepare them again.
+//! Frames prepared before they are needed: in memory, or in a file that outlives the process, so that a capture process
+//! that replaces a killed one does not prepare them again.
 
 use std::borrow::Cow;
 use std::fs::File;
@@ -8,9 +8,9 @@ use std::os::unix::fs::FileExt;
 
 /// First bytes of a file of frames, with the version of its layout.
 const MAGIC: [u8; 16] = *b"semidense fr. 1\n";
-/// Behind it: bytes of a frame, number of frames, and 1 where these are all.
+/// The magic, then bytes of a frame, number of frames, and 1 if these are all.
 const HEADER_BYTES: usize = MAGIC.len() + 3 * 8;
-/// Where the first frame begins: at a page.
+/// Offset of the first frame: a page boundary.
 const FIRST_FRAME: u64 = 4096;
 
 /// Frames of one size, in order.
@@ -29,12 +29,12 @@ enum Kept {
 }
 
 impl FrameStore {
-    /// None yet, in memory.
+    /// Creates an empty store in memory.
     pub fn in_memory(frame_bytes: usize) -> Self {
         Self { frame_bytes, is_complete: false, kept: Kept::Memory(Vec::new()) }
     }
 
-    /// Those that another process has put into `file`, which may be empty.
+    /// Opens the frames that another process has stored in `file`, which may be empty.
     pub fn in_file(file: File, frame_bytes: usize) -> io::Result<Self> {
         let mut header = [0; HEADER_BYTES];
         let is_whole = file.metadata()?.len() >= FIRST_FRAME;
@@ -58,7 +58,7 @@ impl FrameStore {
         Ok(store)
     }
 
-    /// Frames so far.
+    /// Number of frames so far.
     pub fn len(&self) -> usize {
         match &self.kept {
             Kept::Memory(frames) => frames.len(),
@@ -66,23 +66,23 @@ impl FrameStore {
         }
     }
 
-    /// Whether there are none.
+    /// Whether there are no frames.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Whether these are all that there will be.
+    /// Whether the store holds all frames.
     pub fn is_complete(&self) -> bool {
         self.is_complete
     }
 
-    /// These are all.
+    /// Marks the store as complete.
     pub fn complete(&mut self) -> io::Result<()> {
         self.is_complete = true;
         self.write_header()
     }
 
-    /// Adds a frame. In a file it counts when it is whole.
+    /// Adds a frame. In a file it counts only once completely written.
     pub fn push(&mut self, pixels: Vec<u8>) -> io::Result<()> {
         if pixels.len() != self.frame_bytes {
             return Err(io::ErrorKind::InvalidInput.into());
@@ -98,7 +98,7 @@ impl FrameStore {
         Ok(())
     }
 
-    /// Frame `index`; `None` where it is not there.
+    /// Returns frame `index`; `None` if it is missing.
     pub fn get(&self, index: usize) -> Option<Cow<'_, [u8]>> {
         match &self.kept {
             Kept::Memory(frames) => frames.get(index).map(|frame| Cow::Borrowed(&frame[..])),
@@ -129,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_gives_its_frames_to_the_next_process() {
+    fn a_file_passes_its_frames_to_the_next_process() {
         let file = tempfile::tempfile().unwrap();
         let open = |bytes| FrameStore::in_file(file.try_clone().unwrap(), bytes).unwrap();
         let mut first = open(6);

@@ -1,4 +1,4 @@
-//! Image files: PNG and JPEG into grey values or depth, recognised by content, never by name.
+//! Image files: PNG and JPEG, recognised by content, never by name, read as grey values or depth.
 
 use std::fs::File;
 use std::io::Write;
@@ -11,7 +11,7 @@ use crate::slam::image::buffer::Image;
 /// Largest image file: 16-bit RGBA of the largest size, uncompressed.
 const MAX_FILE_BYTES: u64 = (MAX_SIDE * MAX_SIDE * 8) as u64;
 
-/// Steps of a 16-bit depth PNG in a metre, as TUM RGB-D defines them; 0 is "no depth".
+/// Steps per metre of a 16-bit depth PNG, as defined by TUM RGB-D; 0 is "no depth".
 pub const DEPTH_STEPS_PER_METRE: f32 = 5000.0;
 
 /// Why an image file cannot be read or written; names the file.
@@ -22,15 +22,15 @@ pub enum ImageFileError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The content is not the image that is needed.
+    /// The content is not the image needed.
     #[error("{}: {source}", path.display())]
     Decode {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The problem.
         source: DecodeError,
     },
     /// The file cannot be written.
@@ -38,12 +38,12 @@ pub enum ImageFileError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
 }
 
-/// Reads image files one after another in reused memory.
+/// Reads image files one after another, reusing memory.
 #[derive(Debug, Default)]
 pub struct ImageFileReader {
     bytes: Vec<u8>,
@@ -119,7 +119,7 @@ pub fn decode_gray_into(
 
 /// Width and height of PNG or JPEG bytes, pixels.
 pub fn image_size(bytes: &[u8]) -> Result<(usize, usize), DecodeError> {
-    // The size is the first thing that is compared; none is 0 x 0.
+    // The size is compared first; no image is 0 x 0.
     match decode_gray_into(bytes, 0, 0, &mut Vec::new(), &mut []) {
         Err(DecodeError::Size { found, .. }) => Ok(found),
         Err(error) => Err(error),
@@ -137,8 +137,8 @@ pub fn write_gray_png(
     write_png(path, png_image::encode_gray(width, height, png::BitDepth::Eight, pixels))
 }
 
-/// Writes a 16-bit grey PNG, for depth [`DEPTH_STEPS_PER_METRE`] to a metre and 0 where there is
-/// none, under a temporary name first.
+/// Writes a 16-bit grey PNG, for depth [`DEPTH_STEPS_PER_METRE`] to a metre and 0 for none, under a temporary name
+/// first.
 pub fn write_depth_png(
     path: &Path,
     width: usize,
@@ -161,7 +161,7 @@ fn write_png(
             .and_then(|mut file| file.write_all(&bytes))
             .and_then(|()| std::fs::rename(&temporary, path));
         if written.is_err() {
-            // What is left of a full disc helps nobody; the first error is the one to report.
+            // The remains of a write to a full disc are useless; the first error is the one to report.
             let _ = std::fs::remove_file(&temporary);
         }
         written

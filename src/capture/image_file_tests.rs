@@ -1,4 +1,4 @@
-//! Tests of the image files: every kind that cameras and datasets write, and broken ones.
+//! Tests of the image files: every kind that cameras and datasets write, and damaged ones.
 
 use png::{BitDepth, ColorType};
 
@@ -64,7 +64,7 @@ fn jpeg_of_every_kind_becomes_grey() {
     }
 }
 
-/// A file that ends anywhere before its end is never an image.
+/// A file truncated anywhere is never an image.
 #[test]
 fn a_truncated_file_is_an_error_wherever_it_ends() {
     let jpeg = flat_block_jpeg(32, 32, 3, false, |u, v, _| (u * 40 + v * 9) as u8);
@@ -80,7 +80,7 @@ fn a_truncated_file_is_an_error_wherever_it_ends() {
 }
 
 #[test]
-fn corrupt_bytes_are_an_error_or_an_image_but_no_panic() {
+fn corrupt_bytes_give_an_error_or_an_image_but_never_a_panic() {
     let jpeg = flat_block_jpeg(16, 16, 3, false, |u, v, _| (u * 40 + v * 9) as u8);
     let png = png_of(16, 16, ColorType::Rgb, BitDepth::Eight, None, &[90; 16 * 16 * 3]);
     for file in [jpeg, png] {
@@ -93,7 +93,7 @@ fn corrupt_bytes_are_an_error_or_an_image_but_no_panic() {
             }
         }
     }
-    // A PNG has check sums: pixels never change unnoticed.
+    // A PNG has checksums: pixels never change unnoticed.
     let mut broken = png_of(16, 16, ColorType::Grayscale, BitDepth::Eight, None, &[90; 256]);
     let at = broken.len() - 20;
     broken[at] ^= 1;
@@ -101,7 +101,7 @@ fn corrupt_bytes_are_an_error_or_an_image_but_no_panic() {
 }
 
 #[test]
-fn a_hostile_size_is_refused_before_it_is_allocated() {
+fn an_absurd_size_is_refused_before_it_is_allocated() {
     let mut png = png_of(16, 16, ColorType::Rgb, BitDepth::Sixteen, None, &[90; 16 * 16 * 6]);
     png[16..24].copy_from_slice(&[0x7f, 0xff, 0xff, 0xff, 0x7f, 0xff, 0xff, 0xff]);
     assert!(decode(&png, 16, 16).is_err());

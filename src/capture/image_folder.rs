@@ -14,13 +14,13 @@ use crate::capture::{input_file, jpeg_image, png_image};
 const NANOS_PER_SECOND: f64 = 1e9;
 const NANOS_PER_MILLISECOND: f64 = 1e6;
 
-/// Longest exposure that a list may name, in milliseconds; a minute is no video.
+/// Longest exposure that a list may give, milliseconds: with an exposure of a minute it is not video.
 const LONGEST_EXPOSURE_MS: f64 = 60_000.0;
 
-/// Opens the images in `folder`, in natural order of their names (`2.png` before `10.png`); without
-/// `rig` its `camera.txt` serves. Stamps come from `times.txt`, which has either one stamp in
-/// seconds a line, for the images in order, or `name seconds [exposure in milliseconds]`, name with
-/// or without extension, for the images to use; without that file the rig must name its rate.
+/// Opens the images in `folder`, in natural order of their names (`2.png` before `10.png`); without `rig`, its
+/// `camera.txt` is used. Stamps come from `times.txt`, which has either one stamp in seconds per line, for the images
+/// in order, or `name seconds [exposure in milliseconds]`, name with or without extension, for the images to use;
+/// without that file the rig must give its rate.
 pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError> {
     let images = list_images(folder)?;
     if images.is_empty() {
@@ -41,13 +41,13 @@ pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError>
     Recording::new(contents, &rig, rig_path, folder.to_owned())
 }
 
-/// Whether there is an image in `folder`.
+/// Whether `folder` contains an image.
 pub(super) fn has_images(folder: &Path) -> bool {
     list_images(folder).is_ok_and(|images| !images.is_empty())
 }
 
-/// The images of a folder in natural order: what begins like a PNG or JPEG, and what is called one
-/// (so that whatever is wrong with it is found when it is reached).
+/// Lists the images of a folder in natural order: files that begin like a PNG or JPEG, and files named like one (so
+/// that any error in them is found when they are reached).
 fn list_images(folder: &Path) -> Result<Vec<PathBuf>, SourceError> {
     let list = || -> std::io::Result<Vec<PathBuf>> {
         let mut images = Vec::new();
@@ -69,7 +69,7 @@ fn list_images(folder: &Path) -> Result<Vec<PathBuf>, SourceError> {
     Ok(images)
 }
 
-/// Whether a file has the ending of an image.
+/// Whether a file has the extension of an image.
 pub(super) fn is_called_image(path: &Path) -> bool {
     input_file::has_ending(path, &["png", "jpg", "jpeg"])
 }
@@ -80,13 +80,13 @@ fn begins_like_image(path: &Path) -> bool {
         input_file::open(path)?.take(png_image::SIGNATURE.len() as u64).read_to_end(&mut start)?;
         Ok(start)
     };
-    // What cannot be read and is not called an image is somebody else's file.
+    // A file that cannot be read and is not named like an image is not one of ours.
     read().is_ok_and(|start| {
         start == png_image::SIGNATURE || start.starts_with(&jpeg_image::SIGNATURE)
     })
 }
 
-/// Order of names in which a run of digits counts as its number.
+/// Compares names with runs of digits taken as numbers.
 fn natural_order(a: &str, b: &str) -> Ordering {
     let (mut a, mut b) = (a, b);
     loop {
@@ -111,12 +111,12 @@ fn natural_order(a: &str, b: &str) -> Ordering {
     }
 }
 
-/// Length of the run of ASCII digits that a text begins with.
+/// Length of the leading run of ASCII digits.
 fn digits(text: &str) -> usize {
     text.bytes().take_while(u8::is_ascii_digit).count()
 }
 
-/// Frames at a constant rate from 0 on.
+/// Frames at a constant rate, starting at 0.
 fn stamped_at(rate_hz: f64, images: Vec<PathBuf>) -> Vec<ListedImage> {
     let stamp = |i: usize| (i as f64 * NANOS_PER_SECOND / rate_hz).round() as i64;
     let frame = |(i, path)| ListedImage { nanos: stamp(i), path, exposure_nanos: 0 };
@@ -180,7 +180,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_in_names_count_as_numbers() {
+    fn digits_in_names_are_compared_as_numbers() {
         let mut names = ["b1", "a10.png", "a9.png", "a2b3", "a02b10", "a", "a007.png", "é"];
         names.sort_by(|a, b| natural_order(a, b));
         assert_eq!(names, ["a", "a2b3", "a02b10", "a007.png", "a9.png", "a10.png", "b1", "é"]);
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_gives_even_stamps() {
+    fn a_rate_gives_evenly_spaced_stamps() {
         let frames = stamped_at(30.0, vec![PathBuf::new(); 91]);
         assert_eq!(frames[1].nanos, 33_333_333);
         assert_eq!(frames[90].nanos, 3_000_000_000);

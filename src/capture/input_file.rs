@@ -1,15 +1,15 @@
-//! Files and folders that a user names. Files: regular ones only, of bounded size, and opening one never waits.
+//! Files and folders named by a user. Only regular files of bounded size are read, and opening one never waits.
 
 use std::fs::{File, FileType, OpenOptions};
 use std::io::{self, Read};
 use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
-/// Reads at most `max_bytes` of the regular file at `path` into `bytes`, which are replaced. A file
-/// that is larger, and whatever is no regular file, is an error that says so.
+/// Reads the regular file at `path` into `bytes`, replacing its content. A file larger than `max_bytes`, or anything
+/// but a regular file, is an error that says so.
 pub fn read_into(path: &Path, max_bytes: u64, bytes: &mut Vec<u8>) -> io::Result<()> {
     bytes.clear();
-    // One byte more than allowed tells a file that is too large, also one that grows.
+    // One byte more than allowed reveals a file that is too large, even one that grows.
     let length = open(path)?.take(max_bytes.saturating_add(1)).read_to_end(bytes)? as u64;
     if length > max_bytes {
         bytes.clear();
@@ -32,7 +32,7 @@ pub fn read_text(path: &Path, max_bytes: u64) -> io::Result<String> {
     })
 }
 
-/// What is in a folder, in the order of the names; nothing where it cannot be read.
+/// Entries of a folder, sorted by name; empty if it cannot be read.
 pub fn entries(folder: &Path) -> Vec<PathBuf> {
     let found = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let mut paths: Vec<PathBuf> = found.map(|entry| entry.path()).collect();
@@ -40,7 +40,7 @@ pub fn entries(folder: &Path) -> Vec<PathBuf> {
     paths
 }
 
-/// Whether a file's name ends in one of these, in letters of any case.
+/// Whether a file has one of these extensions, in any case.
 pub fn has_ending(path: &Path, endings: &[&str]) -> bool {
     let ending = path.extension().unwrap_or_default();
     endings.iter().any(|known| ending.eq_ignore_ascii_case(known))
@@ -48,17 +48,17 @@ pub fn has_ending(path: &Path, endings: &[&str]) -> bool {
 
 /// Opens the regular file at `path` for reading.
 pub fn open(path: &Path) -> io::Result<File> {
-    // A look before opening, for the words: a socket cannot be opened at all, and a pipe could be
-    // taken from who is meant to read it.
+    // Checked before opening, for a clear error: a socket cannot be opened at all, and opening a pipe could take it
+    // from its intended reader.
     check(std::fs::metadata(path)?.file_type())?;
-    // And one after it, for what may have come in between; a pipe would wait for its writer.
+    // And after opening, in case the file was replaced in between; opening a pipe would wait for its writer.
     let file =
         OpenOptions::new().read(true).custom_flags(libc::O_NONBLOCK | libc::O_NOCTTY).open(path)?;
     check(file.metadata()?.file_type())?;
     Ok(file)
 }
 
-/// Refuses what is not a regular file, with what it is.
+/// Refuses anything but a regular file, and names its kind.
 fn check(kind: FileType) -> io::Result<()> {
     if kind.is_file() {
         return Ok(());
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn only_regular_files_of_the_size_are_read() {
+    fn only_regular_files_of_bounded_size_are_read() {
         let folder = tempfile::tempdir().unwrap();
         let place = |name: &str| folder.path().join(name);
         std::fs::write(place("ten"), [7; 10]).unwrap();

@@ -1,4 +1,4 @@
-//! Grey values of a JPEG in memory, whole or not at all.
+//! Decodes grey values of a JPEG in memory, completely or not at all.
 
 use zune_core::bytestream::ZCursor;
 use zune_core::colorspace::ColorSpace;
@@ -11,10 +11,9 @@ use crate::slam::image::gray::gray_from_interleaved;
 /// The first bytes of every JPEG: start of image, and the start of a marker.
 pub const SIGNATURE: [u8; 3] = [0xff, 0xd8, 0xff];
 
-/// Decodes a JPEG of `width * height` pixels into grey values; `samples` is reused memory for the
-/// rare files whose luma is not stored as such (RGB, CMYK). A file that ends early is an error:
-/// the decoder alone would fill the missing part with grey.
-/// Not noticed is a file with its end marker whose scan lacks blocks: the decoder fills them.
+/// Decodes a JPEG of `width * height` pixels into grey values; `samples` is reused memory for the rare files whose luma
+/// is not stored as such (RGB, CMYK). A file that ends early is an error: the decoder alone would fill the missing part
+/// with grey. A file that has its end marker but lacks blocks in a scan goes unnoticed: the decoder fills them.
 pub fn decode_gray_into(
     bytes: &[u8],
     width: usize,
@@ -47,14 +46,14 @@ pub fn decode_gray_into(
     Ok(())
 }
 
-/// Whether the markers of a JPEG (ITU-T T.81, annex B) lead from its start to its end of image.
-/// Embedded previews lie inside segments and are stepped over.
+/// Whether the markers of a JPEG (ITU-T T.81, annex B) lead from its start to its end of image. Embedded previews lie
+/// inside segments and are skipped.
 fn reaches_end_of_image(bytes: &[u8]) -> bool {
     const END_OF_IMAGE: u8 = 0xd9;
     const START_OF_SCAN: u8 = 0xda;
     let mut at = 2;
     loop {
-        // A marker is 0xff, possibly repeated as filling, and its code.
+        // A marker is 0xff, possibly repeated as padding, and its code.
         if bytes.get(at) != Some(&0xff) {
             return false;
         }
@@ -104,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_is_an_error_and_no_panic() {
+    fn noise_is_an_error_without_a_panic() {
         let mut state = 1u32;
         for length in 0..400 {
             let mut bytes = vec![0xff, 0xd8, 0xff, 0xdb];

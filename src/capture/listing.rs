@@ -6,7 +6,7 @@ use crate::capture::input_file;
 use crate::capture::source_error::SourceError;
 use crate::slam::geometry::se3::SE3;
 
-/// Largest list: a week at 100 Hz with 1 kB a line is far below.
+/// Largest list, bytes: about three hours at 100 Hz with 1 kB per line.
 const MAX_LIST_BYTES: u64 = 1 << 30;
 
 const NANOS_PER_SECOND_DIGITS: i32 = 9;
@@ -23,7 +23,7 @@ pub struct Row<'a> {
 }
 
 impl Row<'_> {
-    /// An error about this line: what is wrong and what to do.
+    /// Returns an error about this line: the problem and what to do.
     pub fn error(&self, problem: impl Into<String>) -> SourceError {
         SourceError::Line { path: self.path.to_owned(), line: self.line, problem: problem.into() }
     }
@@ -50,7 +50,7 @@ impl Row<'_> {
         number.ok_or_else(|| self.error(format!("`{text}` is not a finite number")))
     }
 
-    /// A pose from its numbers; the quaternion is normalised.
+    /// Reads a pose from its numbers; the quaternion is normalised.
     pub fn pose(
         &self,
         [qx, qy, qz, qw]: [&str; 4],
@@ -64,7 +64,7 @@ impl Row<'_> {
         })
     }
 
-    /// Checks that `nanos` comes after the stamp of the row before it.
+    /// Checks that `nanos` is later than the stamp of the previous row.
     pub fn check_after(&self, before: Option<i64>, nanos: i64) -> Result<(), SourceError> {
         let problem = match before {
             Some(before) if nanos == before => "has the same time stamp as",
@@ -83,7 +83,7 @@ pub fn read_text(path: &Path) -> Result<String, SourceError> {
         .map_err(|source| SourceError::Read { path: path.to_owned(), source })
 }
 
-/// The entries of the list at `path`, one a row, whose stamps must grow; `read` gives stamp and entry.
+/// Reads the entries of the list at `path`, one per row, whose stamps must increase; `read` returns stamp and entry.
 pub fn read_list<T>(
     path: &Path,
     read: impl Fn(&Row<'_>) -> Result<(i64, T), SourceError>,
@@ -98,7 +98,7 @@ pub fn read_list<T>(
     Ok(entries)
 }
 
-/// The rows of a list that was read from `path`.
+/// Returns the rows of a list that was read from `path`.
 pub fn rows<'a>(path: &'a Path, text: &'a str) -> impl Iterator<Item = Row<'a>> {
     text.lines().enumerate().filter_map(move |(i, text)| {
         let text = text.trim_start_matches('\u{feff}');
@@ -109,8 +109,8 @@ pub fn rows<'a>(path: &'a Path, text: &'a str) -> impl Iterator<Item = Row<'a>> 
     })
 }
 
-/// Nanoseconds of a decimal number of seconds, exact: no binary fraction in between. Digits below
-/// a nanosecond are cut off. `None` when it is no number or beyond i64.
+/// Converts a decimal number of seconds to nanoseconds exactly: without a binary fraction in between. Digits below a
+/// nanosecond are truncated. `None` if it is not a number or exceeds i64.
 pub fn nanos_from_seconds(text: &str) -> Option<i64> {
     let (mantissa, exponent) = match text.split_once(['e', 'E']) {
         Some((mantissa, exponent)) => (mantissa, exponent.parse::<i16>().ok()?),

@@ -1,4 +1,4 @@
-//! A recording played back and forth at a steady rate: frames without end for benches and soak tests.
+//! A recording played back and forth at a steady rate: endless frames for benchmarks and soak tests.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -11,10 +11,10 @@ use crate::capture::source_error::SourceError;
 use crate::capture::source_name::SourceName;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
-/// Most memory for the frames that are kept, bytes: two thousand VGA images.
+/// Maximum memory for the kept frames, bytes: two thousand VGA images.
 const MAX_KEPT_BYTES: usize = 640 << 20;
 
-/// The frames of another source, from memory, forwards and backwards in turn: the camera never jumps.
+/// The frames of another source, played from memory alternately forwards and backwards: the camera never jumps.
 pub struct Looped {
     name: SourceName,
     inner: Box<dyn FrameSource>,
@@ -22,12 +22,12 @@ pub struct Looped {
     num_frames: u64,
     period_nanos: f64,
     next: u64,
-    /// Images that are left out, for the log.
+    /// Images that were left out, for the log.
     notices: VecDeque<String>,
 }
 
 impl Looped {
-    /// Plays `inner` until `num_frames` have come, `rate_hz` in a second.
+    /// Plays `inner` for `num_frames` frames at `rate_hz`.
     pub fn new(
         name: SourceName,
         inner: Box<dyn FrameSource>,
@@ -40,15 +40,15 @@ impl Looped {
         Self { name, inner, kept, num_frames, period_nanos, next: 0, notices: VecDeque::new() }
     }
 
-    /// The kept frame that is shown as frame `sequence`.
+    /// Index of the kept frame that is shown as frame `sequence`.
     fn place(&self, sequence: u64) -> usize {
         let last = self.kept.len() as u64 - 1;
-        // There and back without showing either end twice.
+        // Back and forth without showing either end twice.
         let phase = sequence % (2 * last).max(1);
         (if phase <= last { phase } else { 2 * last - phase }) as usize
     }
 
-    /// The place of the kept frames fails.
+    /// The error of the store of kept frames.
     fn unkept(&self, source: io::Error) -> SourceError {
         SourceError::Read { path: PathBuf::from(self.name.to_string()), source }
     }
@@ -75,7 +75,7 @@ impl FrameSource for Looped {
         let most = (MAX_KEPT_BYTES / bytes).max(1);
         let total = self.inner.num_frames().map_or(most, |frames| frames.min(most));
         let mut pixels = vec![0; bytes];
-        // What a process before has kept need not be kept again; images that it left out do not count.
+        // Frames that an earlier process has kept need not be kept again; images that it left out do not count.
         let mut num_known = self.kept.len();
         while self.kept.len() < most {
             match self.inner.next_into(&mut pixels) {
@@ -84,13 +84,13 @@ impl FrameSource for Looped {
                     self.kept.push(pixels.clone()).map_err(|source| self.unkept(source))?;
                 }
                 Ok(None) => break,
-                // A hole in what is repeated would come back with every turn: the image is left out.
+                // A gap would recur with every repetition: the image is left out.
                 Err(error) if error.is_passing() => {
                     self.notices.push_back(format!("left out: {error}"))
                 }
                 Err(error) => return Err(error),
             }
-            // Also where nothing new came: it is the sign of life of whoever prepares.
+            // Even without a new frame: this is the sign of life of the preparing process.
             if !progress(self.kept.len().min(total), total) {
                 return Ok(());
             }
@@ -128,7 +128,7 @@ impl FrameSource for Looped {
         self.next += 1;
         Ok(Some(FrameStamp {
             sequence,
-            // From one period on: a stamp of zero is what a camera without a clock gives.
+            // Starts at one period: a stamp of zero is what a camera without a clock gives.
             capture_nanos: ((sequence + 1) as f64 * self.period_nanos) as i64,
             ..FrameStamp::default()
         }))
@@ -170,7 +170,7 @@ mod tests {
         assert!(looped.next_into(&mut pixels).unwrap().is_none());
     }
 
-    /// A source of so many frames, each second of which is damaged.
+    /// A source with its next frame and its number of frames, of which every second is damaged.
     struct Damaged(u64, u64);
 
     impl FrameSource for Damaged {
@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn every_frame_that_is_read_is_a_sign_of_life() {
+    fn every_frame_that_is_read_reports_progress() {
         let file = tempfile::tempfile().unwrap();
         let name: SourceName = "loop:100:30:sim".parse().unwrap();
         let prepare = |most: usize| {
@@ -220,7 +220,7 @@ mod tests {
                 .unwrap();
             signs
         };
-        // Killed in the middle of its preparation; the next one passes what is kept already.
+        // Killed during its preparation; the next one skips the frames already kept.
         assert_eq!(prepare(11), 11);
         assert_eq!(prepare(usize::MAX), 20);
     }
@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn loops_have_a_length_and_a_rate() {
+    fn loops_need_a_length_and_a_rate() {
         for wrong in ["loop:", "loop:0:30:sim", "loop:5:0:sim", "loop:5:inf:sim", "loop:5:30"] {
             assert!(wrong.parse::<SourceName>().is_err(), "{wrong}");
         }

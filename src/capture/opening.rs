@@ -12,17 +12,17 @@ use crate::capture::source_name::SourceName;
 use crate::capture::v4l::params::CameraParams;
 use crate::capture::{bag, euroc, image_folder, stream, tum, v4l};
 
-/// What can be set about sources.
+/// Settings of sources.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SourceParams {
     /// The simulated camera and its world.
     pub simulator: SimulatorParams,
-    /// What is asked of a camera.
+    /// Settings requested of a camera.
     pub camera: CameraParams,
 }
 
-/// Opens a source. `rig` is a rig file, which wins over the calibration that a recording brings. A camera
-/// is opened when its first frame is awaited.
+/// Opens a source. `rig` is a rig file, which overrides a recording's own calibration. A camera is opened when its
+/// first frame is awaited.
 pub fn open(
     name: &SourceName,
     rig: Option<&Path>,
@@ -70,21 +70,21 @@ pub fn open(
     })
 }
 
-/// What a folder without the layout that its source names is by the layout that it has.
+/// For a folder without the layout that its source names, returns the source by the layout that it has.
 fn misnamed(name: &SourceName) -> Option<SourceName> {
     let (SourceName::Tum(folder) | SourceName::Euroc(folder) | SourceName::Images(folder)) = name
     else {
-        // What a loop repeats is looked at when that is opened.
+        // The source of a loop is checked when it is opened.
         return None;
     };
     if name.has_layout() { None } else { SourceName::of_folder(folder) }
 }
 
-/// Where the recording's own camera is another than that of the `rig` which wins over it: what differs,
-/// in one line. `None` where they agree, or the recording brings no camera that can be read.
+/// Describes in one line how the recording's own camera differs from that of the `rig` that overrides it. `None` if
+/// they agree, or if the recording has no camera that can be read.
 fn rig_conflict(name: &SourceName, rig: Option<&Path>) -> Option<String> {
-    /// Displacement that no calibration of the same camera brings about, pixels: files are written
-    /// with few digits, and calibrations of one camera differ by tenths.
+    /// Displacement that no two calibrations of the same camera differ by, pixels: files are written with few digits,
+    /// and calibrations of one camera differ by tenths.
     const MAX_SHIFT_PX: f64 = 2.0;
     let (folder, rig) = (name.folder()?, rig?);
     let (own, own_path) = own_rig(name, folder)?;
@@ -102,8 +102,8 @@ fn rig_conflict(name: &SourceName, rig: Option<&Path>) -> Option<String> {
     })
 }
 
-/// What may be wrong with the camera of a source, one line each: it is another than the recording's own, or
-/// its field of view is unusual.
+/// Remarks on the camera of a source, one line each: it differs from the recording's own, or its field of view is
+/// unusual.
 pub fn rig_remarks(name: &SourceName, rig: Option<&Path>) -> Vec<String> {
     let used = match (name.folder(), rig) {
         (_, Some(path)) => Rig::read(path).ok().map(|rig| (rig, path.to_owned())),
@@ -115,7 +115,7 @@ pub fn rig_remarks(name: &SourceName, rig: Option<&Path>) -> Vec<String> {
     rig_conflict(name, rig).into_iter().chain(unusual).collect()
 }
 
-/// The camera that a recording brings, and where it says so.
+/// Returns a recording's own camera and the path of its file.
 fn own_rig(name: &SourceName, folder: &Path) -> Option<(Rig, PathBuf)> {
     match name {
         SourceName::Euroc(_) => euroc::own_rig(folder),

@@ -1,4 +1,4 @@
-//! Grey and depth images of a PNG in memory, and the PNG files that datasets are written with.
+//! Decodes grey and depth images from a PNG in memory, and encodes the PNG files of datasets.
 
 use std::io::Cursor;
 
@@ -12,7 +12,7 @@ pub const SIGNATURE: [u8; 8] = [0x89, b'P', b'N', b'G', b'\r', b'\n', 0x1a, b'\n
 
 const FORMAT: &str = "PNG";
 
-/// Memory that a decoder may take: the largest image with four 16-bit channels.
+/// Memory that a decoder may use: the largest image with four 16-bit channels.
 const MAX_DECODER_BYTES: usize = MAX_SIDE * MAX_SIDE * 8;
 
 fn damaged(error: png::DecodingError) -> DecodeError {
@@ -72,7 +72,7 @@ pub fn decode_u16(bytes: &[u8], width: usize, height: usize) -> Result<Vec<u16>,
     Ok(samples.chunks_exact(2).map(pair).collect())
 }
 
-/// A reader past the header, whose size has been checked.
+/// Returns a reader past the header, whose size has been checked.
 fn open(
     bytes: &[u8],
     width: usize,
@@ -90,24 +90,24 @@ fn open(
     decoder.read_info().map_err(damaged)
 }
 
-/// Reads the pixels and continues to the end of the file, so that one that is cut short is noticed.
+/// Reads the pixels and continues to the end of the file, so that a truncated file is noticed.
 fn finish(reader: &mut Reader<Cursor<&[u8]>>, samples: &mut [u8]) -> Result<(), DecodeError> {
     reader.next_frame(samples).map_err(damaged)?;
     reader.finish().map_err(damaged)
 }
 
-/// The bytes of a grey PNG; `samples` are rows of `width` samples, big-endian where 16 bits.
+/// Encodes a grey PNG; `samples` are rows of `width` samples, big-endian if 16-bit.
 pub fn encode_gray(
     width: usize,
     height: usize,
     depth: BitDepth,
     samples: &[u8],
 ) -> Result<Vec<u8>, png::EncodingError> {
-    // Sequences are written at many frames a second and read once or twice.
+    // Sequences are written at many frames per second and read once or twice.
     encode((width, height), (ColorType::Grayscale, depth), png::Compression::Fast, samples)
 }
 
-/// The bytes of a grey PNG of 8 bits that is to be small, and takes three times as long.
+/// Encodes an 8-bit grey PNG for small size, which takes three times as long.
 pub fn encode_gray_small(
     width: usize,
     height: usize,
@@ -117,7 +117,7 @@ pub fn encode_gray_small(
     encode((width, height), format, png::Compression::Balanced, samples)
 }
 
-/// The bytes of a colour PNG; `samples` are rows of `width` times red, green, blue.
+/// Encodes a colour PNG; `samples` are rows of `width` times red, green, blue.
 pub fn encode_rgb(
     width: usize,
     height: usize,

@@ -1,8 +1,8 @@
 //! Frames of a recording, whatever its layout: listed images of one camera, played in order.
 //!
-//! What is wrong with a recording's lists is found when it is opened: a bad line, a stamp out of
-//! order. What is wrong with an image, also that it is not there, is found when it is reached, and
-//! whoever plays the recording decides whether to continue with the next.
+//! Errors in a recording's lists, such as a bad line or a stamp out of order, are found when it is opened. Errors in an
+//! image, including a missing one, are found when it is reached, and the caller decides whether to continue with the
+//! next.
 
 use std::path::PathBuf;
 
@@ -30,14 +30,14 @@ pub struct ListedImage {
     pub exposure_nanos: u64,
 }
 
-/// What the lists of a recording say; every list is in order of its stamps.
+/// Contents of a recording's lists; every list is in order of its stamps.
 #[derive(Debug, Clone, Default)]
 pub struct Contents {
     /// The frames.
     pub frames: Vec<ListedImage>,
-    /// Depth images (16-bit PNG), empty where there are none.
+    /// Depth images (16-bit PNG), empty if there are none.
     pub depths: Vec<ListedImage>,
-    /// Ground-truth camera poses, empty where there are none.
+    /// Ground-truth camera poses, empty if there are none.
     pub ground_truth: Vec<StampedPose>,
 }
 
@@ -51,8 +51,8 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// A recording with these contents, taken with the camera of `rig`; `rig_path` is where that
-    /// was read and `listed_in` what listed the frames, both for errors.
+    /// Creates a recording with these contents, taken with the camera of `rig`; `rig_path` is the file of the rig and
+    /// `listed_in` the list or folder of the frames, both for errors.
     pub fn new(
         contents: Contents,
         rig: &Rig,
@@ -66,7 +66,7 @@ impl Recording {
         Ok(Self { contents, rectifier, reader: ImageFileReader::default(), next: 0 })
     }
 
-    /// The depth image nearest to a stamp, where one is near enough.
+    /// Returns the depth image nearest to a stamp, if it is near enough.
     fn nearest_depth(&self, nanos: i64) -> Option<&ListedImage> {
         let depths = &self.contents.depths;
         let after = depths.partition_point(|depth| depth.nanos < nanos);
@@ -91,7 +91,7 @@ impl FrameSource for Recording {
         self.check_buffer(pixels)?;
         let Some(frame) = self.contents.frames.get(self.next) else { return Ok(None) };
         let sequence = self.next as u64;
-        // Counted before it is read: whoever continues after a bad image gets the one after it.
+        // Counted before it is read: a caller that continues after a bad image gets the next one.
         self.next += 1;
         let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
         self.rectifier.read_into(pixels, |gray, _| {
@@ -102,7 +102,7 @@ impl FrameSource for Recording {
     }
 
     fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
-        // Sequences are places in the list: nothing need be read.
+        // Sequences are positions in the list: no image needs to be read.
         let next = usize::try_from(sequence).unwrap_or(usize::MAX).saturating_add(1);
         self.next = self.next.max(next);
         Ok(())

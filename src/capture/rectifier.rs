@@ -1,4 +1,4 @@
-//! From the images that a source reads to the rectified ones that it gives.
+//! Converts the images that a source reads to the rectified ones that it returns.
 
 use std::path::Path;
 
@@ -13,14 +13,14 @@ use crate::slam::image::buffer::Image;
 #[derive(Debug)]
 pub struct Rectifier {
     rectification: Rectification,
-    /// The raw image, where it is not the rectified one.
+    /// The raw image; empty if it is the rectified one.
     raw: Vec<u8>,
-    /// Memory of the decoders.
+    /// Scratch memory of the decoders.
     samples: Vec<u8>,
 }
 
 impl Rectifier {
-    /// For the camera of `rig`, which was read from `rig_path`.
+    /// Creates a rectifier for the camera of `rig`, which was read from `rig_path`.
     pub fn new(rig: &Rig, rig_path: &Path) -> Result<Self, SourceError> {
         let rectification = Rectification::new(&rig.camera)
             .map_err(|source| SourceError::Rectification { path: rig_path.to_owned(), source })?;
@@ -34,7 +34,7 @@ impl Rectifier {
         *self.rectification.intrinsics()
     }
 
-    /// Writes the rectified image of the grey one that `read` writes; its second argument is reused memory.
+    /// Rectifies into `pixels` the grey image that `read` writes; the second argument of `read` is reused memory.
     pub fn read_into<E>(
         &mut self,
         pixels: &mut [u8],
@@ -48,8 +48,8 @@ impl Rectifier {
         Ok(())
     }
 
-    /// Writes the rectified image of a picture of a camera's format, with `stride` bytes from row to row. Grey without
-    /// padding is taken straight from `bytes`, which may be the driver's memory.
+    /// Rectifies into `pixels` a picture in a camera's format, with `stride` bytes from row to row. Grey without
+    /// padding is read directly from `bytes`, which may be the driver's memory.
     pub fn unpack_into(
         &mut self,
         format: PixelFormat,
@@ -68,7 +68,7 @@ impl Rectifier {
         })
     }
 
-    /// The rectified depth image of a raw one; `None` of one that has another size.
+    /// Rectifies a raw depth image; `None` if it has another size.
     pub fn rectify_depth(&self, raw: &Image<f32>) -> Option<Image<f32>> {
         self.rectification.rectify_depth(raw)
     }

@@ -1,4 +1,4 @@
-//! Rigs: what is known about a camera before it is opened, from TOML or a TUM `camera.txt`.
+//! Rigs: the calibration of a camera, known before it is opened, from TOML or a TUM `camera.txt`.
 
 use std::path::Path;
 
@@ -13,30 +13,30 @@ use crate::slam::geometry::camera_model::{CameraModel, Distortion};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::parameter::{ParameterError, check_range};
 
-/// Sides of an image, pixels.
+/// Allowed sides of an image, pixels.
 const SIDE_RANGE: std::ops::RangeInclusive<usize> = 16..=MAX_SIDE;
-/// Focal lengths, pixels: from a fisheye on the smallest image to a telescope on the largest.
+/// Allowed focal lengths, pixels: from a fisheye on the smallest image to a telescope on the largest.
 const FOCAL_RANGE: std::ops::RangeInclusive<f64> = 1.0..=100_000.0;
-/// Lens coefficients; those of rational lenses reach tens.
+/// Allowed lens coefficients; those of rational lenses reach tens.
 const COEFFICIENT_RANGE: std::ops::RangeInclusive<f64> = -1000.0..=1000.0;
-/// Widest view of a lens without a model for it, degrees: at the edge of a pinhole image of 160° a pixel is
+/// Widest view of a lens that is not modelled as a fisheye, degrees: at the edge of a pinhole image of 160° a pixel is
 /// 33 times as fine as in the middle.
 const WIDEST_PINHOLE_DEG: f64 = 160.0;
-/// Widest view that any lens has, degrees; fisheyes that look backwards reach 280.
+/// Widest view of any lens, degrees; fisheyes that look backwards reach 280.
 const WIDEST_DEG: f64 = 300.0;
-/// Narrowest view that is a camera's, degrees; telescopes have less.
+/// Narrowest view of a camera, degrees; telescopes have less.
 const NARROWEST_DEG: f64 = 0.5;
-/// Views that cameras of robots have, degrees; others are remarked.
+/// Usual views of robots' cameras, degrees; others get a remark.
 const USUAL_DEG: std::ops::RangeInclusive<f64> = 10.0..=160.0;
-/// Frames a second.
+/// Allowed frame rates, frames per second.
 const RATE_RANGE: std::ops::RangeInclusive<f64> = 0.1..=1000.0;
 
-/// One camera: lens, intrinsics of the raw image and, where known, its frame rate.
+/// One camera: lens, intrinsics of the raw image and, if known, its frame rate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rig {
     /// The calibrated camera.
     pub camera: CameraModel,
-    /// Frames a second, where the rig names it.
+    /// Frames per second, if the rig gives it.
     pub rate_hz: Option<f64>,
 }
 
@@ -73,7 +73,7 @@ pub struct RigFile {
     /// Lens coefficients in OpenCV's order, as many as the model needs.
     #[serde(default)]
     pub coefficients: Vec<f64>,
-    /// Frames a second.
+    /// Frames per second.
     pub rate_hz: Option<f64>,
 }
 
@@ -131,10 +131,10 @@ impl Rig {
         Ok(file.rig_of(path)?)
     }
 
-    /// By how much the images of two cameras of the same place differ, pixels: the largest shift over
-    /// a grid of rays; infinite where the sizes differ or a ray meets only one of the images.
+    /// Returns the difference between the images of two cameras at the same position, pixels: the largest shift over a
+    /// grid of rays; infinite if the sizes differ or a ray meets only one of the images.
     pub fn largest_shift_px(&self, other: &Self) -> f64 {
-        /// Rays along each side, rims included.
+        /// Rays along each side, borders included.
         const GRID: usize = 9;
         let (own, others) = (self.camera.intrinsics(), other.camera.intrinsics());
         if (own.width, own.height) != (others.width, others.height) {
@@ -150,7 +150,7 @@ impl Rig {
         (0..GRID * GRID).map(|index| shift(index).unwrap_or(f64::INFINITY)).fold(0.0, f64::max)
     }
 
-    /// What is unusual about the camera and may be a mistake, in one line.
+    /// Describes in one line what is unusual about the camera and may be a mistake.
     pub fn remark(&self) -> Option<String> {
         let k = self.camera.intrinsics();
         let is_fisheye = matches!(self.camera.distortion(), Distortion::Equidistant(_));
@@ -172,13 +172,13 @@ impl Rig {
     }
 }
 
-/// Side of an image that is written as any number; a fraction or a negative number becomes 0, which the range refuses.
+/// Converts any number to the side of an image; a fraction or a negative number becomes 0, which the range refuses.
 pub(super) fn side(number: f64) -> usize {
     if number.fract() == 0.0 { number as usize } else { 0 }
 }
 
-/// Angle between the first and the last pixel of a row or column as the focal length alone has it, degrees.
-/// A fisheye's image grows with the angle, that of other lenses with its tangent.
+/// Angle between the first and the last pixel of a row or column by the focal length alone, degrees. A fisheye's image
+/// grows with the angle, that of other lenses with its tangent.
 fn view_deg(focal_px: f64, centre_px: f64, side: usize, is_fisheye: bool) -> f64 {
     let half = |distance_px: f64| match distance_px / focal_px {
         angle if is_fisheye => angle,
@@ -188,7 +188,7 @@ fn view_deg(focal_px: f64, centre_px: f64, side: usize, is_fisheye: bool) -> f64
 }
 
 impl RigFile {
-    /// The checked rig; errors name `path`.
+    /// Checks the values and returns the rig; errors name `path`.
     pub fn rig_of(&self, path: &Path) -> Result<Rig, RigError> {
         self.rig().map_err(|source| RigError::Value { path: path.to_owned(), source })
     }
@@ -221,7 +221,7 @@ impl RigFile {
         check_range("height", self.height, SIDE_RANGE)?;
         check_range("fx", self.fx, FOCAL_RANGE)?;
         check_range("fy", self.fy, FOCAL_RANGE)?;
-        // The view around the optical axis is what is used, so the axis must meet the image.
+        // The view around the optical axis is used, so the axis must meet the image.
         check_range("cx", self.cx, 0.0..=(self.width - 1) as f64)?;
         check_range("cy", self.cy, 0.0..=(self.height - 1) as f64)?;
         self.check_view("fx", self.fx, self.cx, self.width)?;
@@ -276,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unusual_field_of_view_is_remarked_and_an_impossible_one_refused() {
+    fn an_unusual_field_of_view_gets_a_remark_and_an_impossible_one_is_refused() {
         let rig = |model: &str, focal: f64| {
             let lens = if model == "equidistant" { "coefficients = [0, 0, 0, 0]\n" } else { "" };
             let text = format!(

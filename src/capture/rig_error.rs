@@ -14,7 +14,7 @@ pub enum RigError {
         path: PathBuf,
         /// Line, from 1.
         line: usize,
-        /// What is wrong, in one line.
+        /// The problem, in one line.
         problem: String,
     },
     /// A value that no camera can have.

@@ -1,13 +1,13 @@
-//! Images as ROS has them (`sensor_msgs/Image`), and their grey values.
+//! ROS images (`sensor_msgs/Image`) and their grey values.
 
 use crate::capture::decode_error::MAX_SIDE;
 use crate::capture::v4l::pixel_format::{BrokenPicture, PixelFormat, unpack_gray};
 use crate::slam::image::gray::gray_from_rgb;
 
-/// An image of ROS; nothing in it is believed.
+/// A ROS image; none of its fields is trusted.
 #[derive(Debug, Clone, Copy)]
 pub struct RosImage<'a> {
-    /// Name of the format, as `mono8`.
+    /// Name of the format, such as `mono8`.
     pub encoding: &'a str,
     /// Width in pixels.
     pub width: u32,
@@ -15,30 +15,30 @@ pub struct RosImage<'a> {
     pub height: u32,
     /// Bytes from row to row.
     pub step: u32,
-    /// Whether values of more than a byte have their high byte first.
+    /// Whether values of more than one byte have their high byte first.
     pub is_bigendian: bool,
     /// The rows.
     pub data: &'a [u8],
 }
 
-/// Why an image has no grey values.
+/// Why an image cannot be converted to grey values.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RosImageError {
-    /// A format without grey values, or one that is not known.
+    /// A format without grey values, or an unknown one.
     #[error(
         "encoding `{0}`: known are mono8, mono16, rgb8, bgr8, rgba8, bgra8, 8UC1, 8UC3, 8UC4, 16UC1, rgb16, bgr16, bayer_*8, bayer_*16, yuv422, yuv422_yuy2, uyvy, yuyv, nv12, nv21, nv24"
     )]
     Encoding(String),
-    /// A size that no camera has, or another one than the buffer's.
+    /// An invalid size, or one other than the buffer's.
     #[error("an image of {0}x{1} pixels; a side has 2 to 8192, and the size must not change")]
     Size(u32, u32),
-    /// Rows or bytes that do not fit.
+    /// Rows or bytes that do not fit the size.
     #[error(transparent)]
     Picture(#[from] BrokenPicture),
     /// Rows too short for their pixels, or too few bytes.
     #[error("{found} bytes in rows of {step} for {width}x{height} pixels of {encoding}")]
     Short {
-        /// Bytes that there are.
+        /// Bytes found.
         found: usize,
         /// Bytes from row to row.
         step: u32,
@@ -51,19 +51,19 @@ pub enum RosImageError {
     },
 }
 
-/// Where a pixel's values lie.
+/// Layout of a pixel's values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Samples {
-    /// Interleaved: channels in a pixel, bytes of each, and the place of red and blue; green is second.
+    /// Interleaved: channels per pixel, bytes per channel, and the positions of red and blue; green is second.
     Colour { channels: usize, bytes: usize, red: usize, blue: usize },
-    /// One colour a pixel; red at this column and row of each 2 x 2, blue opposite.
+    /// One colour per pixel; red at this column and row of each 2 x 2, blue diagonally opposite.
     Bayer { bytes: usize, red: (usize, usize) },
     /// Grey of two bytes, high byte first.
     WideGray,
 }
 
 impl RosImage<'_> {
-    /// Writes the grey values, `width * height` of them. Values of 16 bits keep their upper eight.
+    /// Writes the `width * height` grey values. Values of 16 bits keep their upper eight.
     pub fn unpack_gray(&self, gray: &mut [u8]) -> Result<(), RosImageError> {
         let (width, height) = (self.width as usize, self.height as usize);
         let sides = 2..=MAX_SIDE;
@@ -101,13 +101,13 @@ impl RosImage<'_> {
         Ok(())
     }
 
-    /// The name of the format as far as an error shows it.
+    /// The name of the format, shortened for an error.
     fn shown(&self) -> String {
         const MOST: usize = 40;
         self.encoding.escape_debug().take(MOST).collect()
     }
 
-    /// The format of cameras that has the same bytes.
+    /// The camera format with the same bytes.
     fn camera_format(&self) -> Option<PixelFormat> {
         Some(match self.encoding {
             "mono8" | "8UC1" => PixelFormat::Grey,
@@ -151,7 +151,7 @@ impl RosImage<'_> {
         })
     }
 
-    /// The upper eight bits of the value at `index` of values of so many bytes.
+    /// The upper eight bits of the value at `index` in a row of values of `bytes` bytes.
     fn value(&self, row: &[u8], index: usize, bytes: usize) -> u8 {
         let high = if bytes == 2 && !self.is_bigendian { 1 } else { 0 };
         row[index * bytes + high]
@@ -169,7 +169,7 @@ impl RosImage<'_> {
         }
     }
 
-    /// A row of one colour a pixel: each colour is the mean of its pixels among the nine around.
+    /// Converts a row of one colour per pixel: each colour is the mean of its pixels among the nine around.
     fn unpack_bayer_row(&self, v: usize, bytes: usize, red: (usize, usize), gray: &mut [u8]) {
         let (width, height, step) = (self.width as usize, self.height as usize, self.step as usize);
         let rows = around(v, height).map(|row| &self.data[row * step..]);
@@ -187,7 +187,7 @@ impl RosImage<'_> {
             }
             let own = (u + red.0) % 2 + parity_rows[1];
             let mean = |colour: usize| match colour == own && colour != 1 {
-                // Its own colour is known here.
+                // Its own colour is measured here.
                 true => self.value(rows[1], u, bytes),
                 false => ((sums[colour].0 + sums[colour].1 / 2) / sums[colour].1.max(1)) as u8,
             };
@@ -196,7 +196,7 @@ impl RosImage<'_> {
     }
 }
 
-/// The places before, at and after `at`; beyond an end the one on the other side, which has the same colour.
+/// The indices before, at and after `at`; beyond an end the one on the other side, which has the same colour.
 fn around(at: usize, length: usize) -> [usize; 3] {
     let before = if at == 0 { 1 } else { at - 1 };
     let after = if at + 1 == length { length - 2 } else { at + 1 };
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn channels_and_bytes_are_where_the_encoding_has_them() {
+    fn channels_and_bytes_follow_the_encoding() {
         let red = [76; 4];
         assert_eq!(unpack("rgb8", false, &[255, 0, 0].repeat(4), 6), red);
         assert_eq!(unpack("bgr8", false, &[0, 0, 255].repeat(4), 6), red);
@@ -259,7 +259,7 @@ mod tests {
         assert_eq!(unpack("yuv422", false, &[1, 90].repeat(4), 4), [90; 4]);
         assert_eq!(unpack("yuv422_yuy2", false, &[90, 1].repeat(4), 4), [90; 4]);
         assert_eq!(unpack("nv21", false, &[90, 90, 90, 90, 1, 1], 2), [90; 4]);
-        // Padding behind a row is none of its pixels.
+        // Padding after a row is not part of its pixels.
         assert_eq!(unpack("mono8", false, &[5, 6, 0, 7, 8], 3), [5, 6, 7, 8]);
     }
 
@@ -295,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_images_are_errors() {
+    fn invalid_images_are_errors() {
         let data = vec![1; 64];
         for encoding in ALL {
             for (width, height, step, length) in [

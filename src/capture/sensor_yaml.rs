@@ -1,7 +1,7 @@
-//! The `sensor.yaml` of a EuRoC camera: lens, intrinsics, and where the camera sits on the body.
+//! The `sensor.yaml` of a EuRoC camera: lens, intrinsics, and the camera's pose on the body.
 //!
-//! Only what these files use of YAML is read: `key: value`, lists in brackets, one level of keys
-//! below a key. Anything else is an error with its line, never a guess.
+//! Only the part of YAML that these files use is read: `key: value`, lists in brackets, one level of keys below a key.
+//! Anything else is an error that names its line, never a guess.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -13,19 +13,19 @@ use crate::capture::rig::{LensModel, Rig, RigFile, side};
 use crate::capture::source_error::SourceError;
 use crate::slam::geometry::se3::SE3;
 
-/// How far the rotation of `T_BS` may be from orthonormal: files are written with few digits.
+/// Largest deviation of the rotation of `T_BS` from orthonormal: files are written with few digits.
 const ROTATION_TOLERANCE: f64 = 1e-3;
 
-/// What a camera's `sensor.yaml` says.
+/// Contents of a camera's `sensor.yaml`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SensorYaml {
     /// Lens, intrinsics and rate.
     pub rig: Rig,
-    /// `T_BS`: pose of the camera on the body that the ground truth is about.
+    /// `T_BS`: pose of the camera on the body that the ground truth describes.
     pub body_from_camera: SE3,
 }
 
-/// A value with the line that its key stands in.
+/// A value with the line of its key.
 struct Entry<'a> {
     row: Row<'a>,
     value: String,
@@ -75,7 +75,7 @@ pub fn parse(path: &Path, text: &str) -> Result<SensorYaml, SourceError> {
     Ok(SensorYaml { rig, body_from_camera })
 }
 
-/// All entries by key, `outer.inner` below a key.
+/// Reads all entries by key, `outer.inner` below a key.
 fn read_entries<'a>(
     path: &'a Path,
     text: &'a str,
@@ -84,7 +84,7 @@ fn read_entries<'a>(
     let mut outer = String::new();
     let mut open_list: Option<(String, Entry<'a>)> = None;
     for row in rows(path, text) {
-        // A comment behind a value; none of these files has a `#` inside a value.
+        // Drops a comment after a value; none of these files has a `#` inside a value.
         let content = row.text.split('#').next().unwrap_or_default().trim();
         if content.starts_with('%') || content == "---" || content.is_empty() {
             continue;
@@ -135,7 +135,7 @@ impl Entry<'_> {
     }
 }
 
-/// A rigid transform from the rows of its 4×4 matrix; `None` where it is none.
+/// Returns a rigid transform from the rows of its 4×4 matrix; `None` if it is not rigid.
 fn rigid_from_rows(m: &[f64; 16]) -> Option<SE3> {
     let &[a, b, c, x, d, e, f, y, g, h, i, z, 0.0, 0.0, 0.0, 1.0] = m else { return None };
     let matrix = Matrix3::new(a, b, c, d, e, f, g, h, i);
@@ -198,7 +198,7 @@ distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
     }
 
     #[test]
-    fn what_is_wrong_is_named_with_its_line() {
+    fn errors_name_the_line() {
         for (from, to, expected) in [
             ("resolution: [752, 480]", "resolution: [752]", "line 17: needs 2 numbers, has 1"),
             ("[752, 480]", "[752, 4.5]", "height = 0: must be 16 to 8192"),

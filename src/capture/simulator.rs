@@ -1,7 +1,7 @@
 //! The simulator: a camera in a textured scene, with exact poses and exact depth.
 //!
-//! `trajectory` says where the camera is, `render` what it sees there, `sensor` what becomes
-//! of the light; `furnish` builds the scenes. The same [`params`] give the same bytes.
+//! `trajectory` is the camera's path, `render` what the camera sees on it, `sensor` the conversion of light to pixels;
+//! `furnish` builds the scenes. The same [`params`] give the same bytes.
 
 use std::borrow::Cow;
 use std::fs::File;
@@ -52,31 +52,30 @@ pub(crate) mod trajectory;
 pub(crate) mod twins;
 mod view;
 
-/// Stamp of the first frame: one second, so that no reader takes it for a missing one.
+/// Stamp of the first frame: one second, so that no reader takes it for a missing stamp.
 const FIRST_NANOS: i64 = 1_000_000_000;
 /// Frames rendered between two reports of progress.
 const FRAMES_PER_REPORT: usize = 8;
-/// Motion blur is averaged over instants that lie at most this far apart in the image.
+/// Motion blur is averaged over instants at most this far apart in the image, but over no more than `MAX_BLUR_STEPS`.
 const BLUR_STEP_PX: f64 = 1.0;
-/// Most instants of one exposure.
+/// Maximum number of instants of one exposure.
 const MAX_BLUR_STEPS: usize = 24;
 
 /// A simulated camera as a source of frames.
 ///
-/// [`FrameSource::prepare`] renders all frames on the current rayon pool and keeps them:
-/// `frames × width × height` bytes, 184 MB for the default 600 frames; frames that were not prepared
-/// are rendered when they are asked for. Depth is always cast when asked for. Frames of a distorted
-/// lens are rectified as they are handed out.
+/// [`FrameSource::prepare`] renders all frames on the current rayon pool and keeps them: `frames × width × height`
+/// bytes, 184 MB for the default 600 frames; frames that were not prepared are rendered on request. Depth is always
+/// cast on request. Frames of a distorted lens are rectified when they are returned.
 #[derive(Debug)]
 pub struct Simulator {
     params: SimulatorParams,
-    /// Painted when the first frame is rendered: a capture that takes the place of another has its frames.
+    /// Painted when the first frame is rendered: a capture process that replaces another already has its frames.
     scene: OnceLock<Scene>,
     camera: CameraModel,
     /// Rays of the raw images.
     lens: Lens,
     rectification: Rectification,
-    /// Rays of the rectified images, where they are not the raw ones.
+    /// Rays of the rectified images, if they differ from the raw ones.
     rectified_lens: Option<Lens>,
     sensor: Sensor,
     trajectory: Trajectory,
@@ -96,7 +95,7 @@ impl Simulator {
         Ok(simulator)
     }
 
-    /// Builds the path alone. The first frame is to be asked for as a [`FrameSource`]: the scene is painted on the
+    /// Builds only the path. The first frame must be requested through [`FrameSource`]: the scene is painted on the
     /// rayon pool, which must not be busy with frames that wait for it.
     pub fn unpainted(params: SimulatorParams) -> Result<Self, ParameterError> {
         params.validate()?;
@@ -183,9 +182,9 @@ impl Simulator {
         light
     }
 
-    /// How many instants an exposure is averaged over: one a pixel of motion.
+    /// Number of instants that an exposure is averaged over: one per pixel of motion.
     fn blur_steps(&self, middle_s: f64, exposure_s: f64) -> usize {
-        /// Distance at which the motion is judged: most of the scene lies farther.
+        /// Distance at which the motion is estimated: most of the scene is farther away.
         const TYPICAL_DEPTH_M: f64 = 1.5;
         if exposure_s == 0.0 {
             return 1;
@@ -198,7 +197,7 @@ impl Simulator {
         ((motion_px / BLUR_STEP_PX).ceil() as usize + 1).clamp(2, MAX_BLUR_STEPS)
     }
 
-    /// Renders one frame as the sensor gives it.
+    /// Renders one frame as read out by the sensor.
     fn render(&self, frame: usize, scratch: &mut RenderScratch) -> Vec<u8> {
         let mut light = self.light(frame, scratch);
         let mut pixels = vec![0; light.len()];
@@ -211,8 +210,8 @@ impl Simulator {
         &self.camera
     }
 
-    /// The raw image of a frame, as the sensor gives it: from memory where it has been prepared,
-    /// rendered otherwise. `None` beyond the last frame.
+    /// Returns the raw image of a frame, as read out by the sensor: from memory if it has been prepared, rendered
+    /// otherwise. `None` beyond the last frame.
     pub fn raw_frame(&self, frame: usize) -> Option<Cow<'_, [u8]>> {
         if frame >= self.params.frames {
             return None;
@@ -221,8 +220,8 @@ impl Simulator {
         Some(self.frames.get(frame).unwrap_or_else(render))
     }
 
-    /// Exact depth along the optical axis of the raw image at a frame's ground-truth pose, in world
-    /// units (0 where nothing is). `None` beyond the last frame.
+    /// Exact depth along the optical axis of the raw image at a frame's ground-truth pose, in world units (0 where
+    /// there is no surface). `None` beyond the last frame.
     pub fn raw_depth(&self, frame: usize) -> Option<Image<f32>> {
         let mut scratch = RenderScratch::default();
         (frame < self.params.frames).then(|| self.depth_through(&self.lens, frame, &mut scratch))
@@ -240,7 +239,7 @@ impl Simulator {
         let pixels = self.render(frame, scratch);
         let SensorParams { exposure_ms, row_time_us, .. } = self.params.sensor;
         let depth = match exposure_ms == 0.0 && row_time_us == 0.0 {
-            // The image was cast at the one pose of the frame: its depth is there already.
+            // The image was cast at the frame's only pose, so its depth is already available.
             true => self.depth_of_last(&self.lens, scratch),
             false => self.depth_through(&self.lens, frame, scratch),
         };
@@ -252,7 +251,7 @@ impl Simulator {
         self.depth_of_last(lens, scratch)
     }
 
-    /// Depth as it was last cast through `lens`, in world units.
+    /// Depth last cast through `lens`, in world units.
     fn depth_of_last(&self, lens: &Lens, scratch: &RenderScratch) -> Image<f32> {
         let mut depth = Image::filled(lens.width, lens.height, 0.0);
         scratch.depth_into(depth.pixels_mut());
@@ -284,7 +283,7 @@ impl FrameSource for Simulator {
     ) -> Result<(), SourceError> {
         let total = self.params.frames;
         if self.frames.len() < total {
-            // Before the frames that are rendered side by side.
+            // Before the frames, which are rendered in parallel.
             self.scene();
         }
         while self.frames.len() < total {

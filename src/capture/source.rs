@@ -1,4 +1,4 @@
-//! The trait of everything that frames come from.
+//! The trait of all sources of frames.
 
 use std::fs::File;
 use std::os::fd::BorrowedFd;
@@ -11,7 +11,7 @@ use crate::slam::trajectory::StampedPose;
 /// Stamp of a frame just read.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct FrameStamp {
-    /// Number of the frame at its source, from 0; a gap is a frame that the source lost.
+    /// Number of the frame at its source, from 0; a gap means frames that the source lost.
     pub sequence: u64,
     /// Middle of the exposure, nanoseconds of the source's clock.
     pub capture_nanos: i64,
@@ -19,28 +19,28 @@ pub struct FrameStamp {
     pub exposure_nanos: u64,
     /// Sensor gain, 0 where unknown.
     pub gain: f32,
-    /// The same instant by this machine's clocks, where the source knows it; otherwise capture finds it.
+    /// The same instant by this machine's clocks, if the source has it; otherwise capture determines it.
     pub clocks: Option<FrameClocks>,
 }
 
 /// An instant by the clocks of this machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FrameClocks {
-    /// CLOCK_MONOTONIC, nanoseconds: what latency counts from.
+    /// CLOCK_MONOTONIC, nanoseconds: latency counts from here.
     pub clock_nanos: i64,
-    /// CLOCK_REALTIME, nanoseconds, or what the sender has in its place: the stamp exactly as it came, so that who
-    /// reads poses can match them with the images by equality.
+    /// CLOCK_REALTIME, nanoseconds, or the sender's clock in its place: the stamp exactly as received, so that a reader
+    /// of poses can match them with the images by equality.
     pub realtime_nanos: i64,
 }
 
-/// What waiting for a frame came to.
+/// Outcome of waiting for a frame.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Arrival {
     /// The next frame can be read at once.
     Frame,
-    /// None yet: the time is over, or the caller was woken.
+    /// No frame yet: the time has passed, or the caller was woken.
     Nothing,
-    /// There is no camera to read from, for this reason; it is opened as soon as it can be.
+    /// There is no camera to read from, for this reason; it is opened as soon as possible.
     Absent(String),
 }
 
@@ -49,34 +49,34 @@ pub enum Arrival {
 pub(in crate::capture) struct Absence {
     /// The reason, for the user.
     pub reason: String,
-    /// Whether it may pass by itself.
+    /// Whether it may pass without intervention.
     pub passes: bool,
 }
 
 impl Absence {
-    /// One that may pass by itself.
+    /// An absence that may pass without intervention.
     pub fn passing(reason: String) -> Self {
         Self { reason, passes: true }
     }
 }
 
-/// Frames of a camera that did not become frames here.
+/// Frames of a camera that were not delivered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct FrameLosses {
-    /// Never came, by the driver's numbers.
+    /// Never arrived, by the driver's numbers.
     pub missing: u64,
-    /// Came, and were passed over for a newer one.
+    /// Arrived, and were skipped for a newer one.
     pub late: u64,
-    /// Came damaged.
+    /// Arrived damaged.
     pub broken: u64,
 }
 
 /// A remark of a source for the log.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Notice {
-    /// What is remarked.
+    /// The remark.
     pub text: String,
-    /// Whether something is not as it was asked for.
+    /// Whether something differs from what was requested.
     pub is_warning: bool,
 }
 
@@ -85,20 +85,20 @@ pub trait FrameSource: Send {
     /// Intrinsics of the rectified frames.
     fn intrinsics(&self) -> Intrinsics;
 
-    /// How many frames there will be, where that is known (recordings, simulator).
+    /// Total number of frames, if known (recordings, simulator).
     fn num_frames(&self) -> Option<usize> {
         None
     }
 
-    /// Keeps frames that are prepared in `file` and takes those that are there: of a process of the same source
-    /// that was killed. Sources that prepare none have no use for it.
+    /// Keeps prepared frames in `file` and takes over those already in it, from a killed process with the same source.
+    /// Sources that prepare no frames ignore it.
     fn keep_prepared_in(&mut self, file: File) -> std::io::Result<()> {
         drop(file);
         Ok(())
     }
 
-    /// Work that must be over before the first frame is published (the simulator renders here).
-    /// `progress` is called with (done, total) and returns false to stop early.
+    /// Does the work that must be finished before the first frame is published (the simulator renders here). `progress`
+    /// is called with (done, total) and returns false to stop early.
     fn prepare(
         &mut self,
         progress: &mut dyn FnMut(usize, usize) -> bool,
@@ -107,16 +107,15 @@ pub trait FrameSource: Send {
         Ok(())
     }
 
-    /// Waits until the next frame can be read, at most `millis`, or until `wake` can be read. Recordings
-    /// always have one, or their end.
+    /// Waits up to `millis` until the next frame can be read, or until `wake` can be read. Recordings always have a
+    /// next frame, or their end.
     fn await_frame(&mut self, wake: BorrowedFd<'_>, millis: u32) -> Result<Arrival, SourceError> {
         let _ = (wake, millis);
         Ok(Arrival::Frame)
     }
 
-    /// Writes the next frame into `pixels` (`width * height` of [`FrameSource::intrinsics`]);
-    /// `None` after the last. After an error the next call continues with the frame after it; what
-    /// `pixels` holds then is not a frame.
+    /// Writes the next frame into `pixels` (`width * height` of [`FrameSource::intrinsics`]); `None` after the last.
+    /// After an error the next call continues with the frame after it; the contents of `pixels` are then not a frame.
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError>;
 
     /// Checks that `pixels` has room for a frame and no more.
@@ -128,7 +127,7 @@ pub trait FrameSource: Send {
         }
     }
 
-    /// Leaves out frames until the next one comes after `sequence`.
+    /// Skips frames until the next one comes after `sequence`.
     fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
         let k = self.intrinsics();
         let mut pixels = vec![0; k.width * k.height];
@@ -142,23 +141,23 @@ pub trait FrameSource: Send {
         }
     }
 
-    /// What a camera has lost so far; `None` for recordings, which lose nothing.
+    /// Frames that a camera has lost so far; `None` for recordings, which lose none.
     fn losses(&self) -> Option<FrameLosses> {
         None
     }
 
-    /// A remark for the log that nobody has taken yet: what was granted, what was refused.
+    /// Takes the next remark for the log, on what was granted or refused.
     fn take_notice(&mut self) -> Option<Notice> {
         None
     }
 
-    /// Ground-truth camera poses in order of their stamps, empty where there are none.
+    /// Ground-truth camera poses in order of their stamps, empty if there are none.
     fn ground_truth(&self) -> &[StampedPose] {
         &[]
     }
 
-    /// Ground-truth depth in metres (0 where none) of the frame with this stamp, rectified like the
-    /// frames; `None` where the source has none for it.
+    /// Ground-truth depth in metres (0 where none) of the frame with this stamp, rectified like the frames; `None` if
+    /// the source has none for it.
     fn depth_at(&mut self, capture_nanos: i64) -> Result<Option<Image<f32>>, SourceError> {
         let _ = capture_nanos;
         Ok(None)

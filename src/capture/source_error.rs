@@ -1,4 +1,4 @@
-//! Why frames cannot be had: what is wrong with a source, where, and what to do.
+//! Errors of sources of frames: what is wrong, where, and what to do.
 
 use std::path::PathBuf;
 
@@ -10,32 +10,32 @@ use crate::slam::parameter::ParameterError;
 
 pub use crate::capture::bag::bag_error::{BagError, BagImageError};
 
-/// Why a source cannot be opened or gave no frame; says what, where and what to do.
+/// Why a source cannot be opened or returned no frame; states what is wrong, where, and what to do.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
-    /// The name of a source is not understood, or nothing can be opened by it.
+    /// The name of a source is not understood, or cannot be opened.
     #[error("source `{name}`: {problem}")]
     Name {
-        /// The name as it was given.
+        /// The name as given.
         name: String,
-        /// What is wrong with it, and what to do.
+        /// The problem, and what to do.
         problem: String,
     },
-    /// A path that leads nowhere.
+    /// A path that does not exist.
     #[error("there is no such file or folder: {path}; {hint}")]
     NoPath {
-        /// The path as it was given.
+        /// The path as given.
         path: String,
         /// What may have been meant.
         hint: String,
     },
-    /// A video, which has to be made a folder of images first.
+    /// A video, which must first be converted to a folder of images.
     #[error(
         "source `{path}`: by its name this is a video: make a folder of images and times from it with the command below, \
          then name that folder, with --rig FILE for the camera"
     )]
     Video {
-        /// The path as it was given.
+        /// The path as given.
         path: String,
         /// The command that makes the folder, for the shell.
         command: String,
@@ -45,7 +45,7 @@ pub enum SourceError {
     Read {
         /// The file or folder.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A line of a list or calibration file is wrong.
@@ -55,16 +55,16 @@ pub enum SourceError {
         path: PathBuf,
         /// Line, from 1.
         line: usize,
-        /// What is wrong and what to do.
+        /// The problem, and what to do.
         problem: String,
     },
-    /// There is not a single frame.
+    /// No frames.
     #[error("{}: has no frames; check that this is the right recording", path.display())]
     Empty {
         /// The list or folder.
         path: PathBuf,
     },
-    /// Nothing says what the camera is.
+    /// No description of the camera.
     #[error(
         "{}: has no camera.txt; name the camera with --rig FILE (examples: config/rigs, /usr/share/semidense/rigs)",
         folder.display()
@@ -73,7 +73,7 @@ pub enum SourceError {
         /// The recording's folder.
         folder: PathBuf,
     },
-    /// Nothing says when the images were taken.
+    /// No stamps for the images.
     #[error(
         "{}: has no times.txt and {} names no rate_hz; add one of them (name a rig with --rig)",
         folder.display(), rig.display()
@@ -84,7 +84,7 @@ pub enum SourceError {
         /// The rig or camera.txt.
         rig: PathBuf,
     },
-    /// A list of stamps ends before the images do.
+    /// Fewer stamps than images.
     #[error(
         "{}: has {} for {}; give each image one", path.display(), counted(*stamps, "time stamp"),
         counted(*images, "image")
@@ -105,7 +105,7 @@ pub enum SourceError {
     Rectification {
         /// The rig file.
         path: PathBuf,
-        /// Why not.
+        /// The cause.
         source: RectificationError,
     },
     /// A parameter of the simulator is out of its range.
@@ -114,20 +114,20 @@ pub enum SourceError {
     /// An image of the sequence is not usable.
     #[error(transparent)]
     Image(#[from] ImageFileError),
-    /// A camera, or a stream of frames, that cannot serve.
+    /// A camera or a stream of frames cannot be used.
     #[error("{name}: {reason}")]
     Camera {
         /// The source.
         name: String,
-        /// Why, and what to do.
+        /// The reason, and what to do.
         reason: String,
     },
-    /// A frame came damaged; the next may be good.
+    /// A frame arrived damaged; the next one may be valid.
     #[error("{name}: a damaged frame: {reason}")]
     BrokenFrame {
         /// The source.
         name: String,
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
     },
     /// A bag cannot be used.
@@ -135,25 +135,25 @@ pub enum SourceError {
     Bag {
         /// The file.
         path: PathBuf,
-        /// Why, and what to do.
+        /// The reason, and what to do.
         problem: BagError,
     },
-    /// An image of a bag is not usable; the next may be good.
+    /// An image of a bag is not usable; the next one may be valid.
     #[error("{}: an image on {topic} {problem}", path.display())]
     BagImage {
         /// The file.
         path: PathBuf,
         /// The topic.
         topic: String,
-        /// What is wrong with it.
+        /// The problem.
         problem: BagImageError,
     },
-    /// A recording without one image that can be used.
+    /// A recording without a usable image.
     #[error("none of its {count} images can be used; the first: {first}")]
     AllDamaged {
-        /// Images.
+        /// Number of images.
         count: u64,
-        /// Which the first is, and what is wrong with it.
+        /// The first image and its error.
         first: String,
     },
     /// The caller's buffer does not fit the frames.
@@ -169,7 +169,7 @@ pub enum SourceError {
 }
 
 impl SourceError {
-    /// A command that the message refers to; printed on a line of its own, it can be copied.
+    /// A command that the message refers to; printed on a separate line, it can be copied.
     pub fn command(&self) -> Option<&str> {
         match self {
             Self::Video { command, .. } => Some(command),
@@ -177,8 +177,8 @@ impl SourceError {
         }
     }
 
-    /// Whether only this frame is lost and the next may be good: a damaged frame of a camera, a damaged or
-    /// missing image of a recording.
+    /// Whether only this frame is lost and the next one may be valid: a damaged frame of a camera, a damaged or missing
+    /// image of a recording.
     pub fn is_passing(&self) -> bool {
         matches!(self, Self::BrokenFrame { .. } | Self::Image(_) | Self::BagImage { .. })
     }

@@ -1,4 +1,4 @@
-//! Names of sources as the command line takes them, and what a folder without a name is.
+//! Names of sources on the command line, and recognition of a path without a kind.
 
 use std::ffi::{OsStr, OsString};
 use std::fmt;
@@ -15,22 +15,22 @@ use crate::capture::{euroc, image_folder, tum};
 /// The forms of a source name, for errors and help.
 pub const SOURCE_FORMS: &str = "a folder (TUM, EuRoC or images), sim[:SCENE], tum:DIR, euroc:DIR, images:DIR, mcap:FILE[:TOPIC], v4l:DEVICE, ros2:TOPIC, stream:SOCKET and loop:FRAMES:HZ:SOURCE";
 
-/// Endings of video files.
+/// Extensions of video files.
 const VIDEO_ENDINGS: [&str; 12] =
     ["mp4", "m4v", "mov", "mkv", "webm", "avi", "mpg", "mpeg", "ts", "wmv", "ogv", "h264"];
-/// Endings of files in which recordings are packed.
+/// Extensions of archives in which recordings are packed.
 const ARCHIVE_ENDINGS: [&str; 6] = ["zip", "tgz", "gz", "tar", "7z", "xz"];
-/// Endings of what ROS records.
+/// Extensions of ROS recordings.
 const BAG_ENDINGS: [&str; 2] = ["bag", "db3"];
-/// Names of a folder's content that an error lists.
+/// Maximum number of a folder's entries that an error lists.
 const MAX_LISTED: usize = 6;
 
-/// The name of a source, as the command line takes it.
+/// The name of a source, as given on the command line.
 #[derive(Debug, Clone, PartialEq)]
 pub enum SourceName {
     /// `sim[:SCENE]`: the simulator.
     Simulator {
-        /// The scene, where one is named.
+        /// The scene, if one is named.
         scene: Option<String>,
     },
     /// `tum:DIR`: a recording in the layout of TUM RGB-D.
@@ -43,7 +43,7 @@ pub enum SourceName {
     Mcap {
         /// The file.
         file: PathBuf,
-        /// The topic of the images, where one is named.
+        /// The topic of the images, if one is named.
         topic: Option<String>,
     },
     /// `v4l:DEVICE`: a camera, by its path, its number or the name that udev gives it.
@@ -52,19 +52,19 @@ pub enum SourceName {
     Stream(PathBuf),
     /// `ros2:TOPIC`: images of a ROS 2 topic.
     Ros2(String),
-    /// `loop:FRAMES:HZ:SOURCE`: a recording back and forth, for benches and soak tests.
+    /// `loop:FRAMES:HZ:SOURCE`: a recording played back and forth, for benchmarks and soak tests.
     Looped {
-        /// Frames in all.
+        /// Total number of frames.
         num_frames: u64,
-        /// Frames in a second.
+        /// Frames per second.
         rate_hz: f64,
-        /// What is repeated.
+        /// The source that is repeated.
         inner: Box<SourceName>,
     },
 }
 
 impl SourceName {
-    /// Whether frames come at their own pace, whether or not somebody takes them.
+    /// Whether frames arrive at their own pace, whether or not they are read.
     pub fn is_camera(&self) -> bool {
         matches!(self, Self::Camera(_) | Self::Stream(_) | Self::Ros2(_))
     }
@@ -78,7 +78,7 @@ impl SourceName {
         }
     }
 
-    /// Reads a name: `kind:place`, or a path, whose layout is recognised. A path may have any bytes.
+    /// Parses a name: `kind:place`, or a path, whose layout is recognised. A path may contain any bytes.
     pub fn parse(name: &OsStr) -> Result<Self, SourceError> {
         let error = |problem: &str| name_error(name, problem);
         let bytes = name.as_bytes();
@@ -99,7 +99,7 @@ impl SourceName {
             b"loop" => text(rest)?
                 .and_then(|text| parse_loop(&text))
                 .unwrap_or_else(|| Err(error("write loop:FRAMES:HZ:SOURCE, as loop:9000:30:sim"))),
-            // A folder may be called like a kind.
+            // A folder may have the name of a kind.
             b"tum" | b"euroc" | b"images" if bytes == kind && Path::new(name).is_dir() => {
                 recognise(Path::new(name))
             }
@@ -121,7 +121,7 @@ impl SourceName {
         }
     }
 
-    /// The name as an argument of another process, byte by byte.
+    /// The name as an argument of another process, byte for byte.
     pub fn to_os_string(&self) -> OsString {
         fn with(kind: &str, place: impl AsRef<OsStr>) -> OsString {
             let mut name = OsString::from(kind);
@@ -148,7 +148,7 @@ impl SourceName {
         }
     }
 
-    /// Whether the list by which a layout is known, or an image, is where it belongs.
+    /// Whether the folder has the list that identifies its layout, or an image.
     pub(super) fn has_layout(&self) -> bool {
         match self {
             Self::Tum(folder) => folder.join(tum::FRAME_LIST).exists(),
@@ -158,7 +158,7 @@ impl SourceName {
         }
     }
 
-    /// The recording that a folder holds by its layout.
+    /// Returns the recording in a folder, recognised by its layout.
     pub(super) fn of_folder(folder: &Path) -> Option<Self> {
         [Self::Tum, Self::Euroc, Self::Images]
             .into_iter()
@@ -185,7 +185,7 @@ fn name_error(name: &OsStr, problem: &str) -> SourceError {
     SourceError::Name { name: name.to_string_lossy().into_owned(), problem: problem.to_owned() }
 }
 
-/// `FILE[:TOPIC]`: a topic begins with `/`, and a file that is there is no topic. A folder stands for the one file in it.
+/// Parses `FILE[:TOPIC]`: a topic begins with `/`, and an existing path has no topic. A folder means its only file.
 fn parse_mcap(whole: &Path) -> Result<SourceName, SourceError> {
     let bytes = whole.as_os_str().as_bytes();
     let colon = bytes.windows(2).rposition(|pair| pair == b":/").filter(|_| !whole.exists());
@@ -198,7 +198,7 @@ fn parse_mcap(whole: &Path) -> Result<SourceName, SourceError> {
     Ok(SourceName::Mcap { file, topic })
 }
 
-/// The one MCAP file of a folder, as `ros2 bag record` makes it.
+/// Returns the only MCAP file of a folder, as `ros2 bag record` creates it.
 fn only_mcap(folder: &Path) -> Result<PathBuf, SourceError> {
     let files = mcap_files(folder);
     match &files[..] {
@@ -215,14 +215,14 @@ fn only_mcap(folder: &Path) -> Result<PathBuf, SourceError> {
     }
 }
 
-/// The MCAP files of a folder in the order of their names.
+/// The MCAP files of a folder, sorted by name.
 fn mcap_files(folder: &Path) -> Vec<PathBuf> {
     let mut files = entries(folder);
     files.retain(|path| has_ending(path, &["mcap"]));
     files
 }
 
-/// `FRAMES:HZ:SOURCE`; `None` where it has another form.
+/// Parses `FRAMES:HZ:SOURCE`; `None` if it has another form.
 fn parse_loop(text: &str) -> Option<Result<SourceName, SourceError>> {
     let mut parts = text.splitn(3, ':');
     let num_frames = parts.next()?.parse().ok().filter(|&frames| frames > 0)?;
@@ -232,7 +232,7 @@ fn parse_loop(text: &str) -> Option<Result<SourceName, SourceError>> {
     Some(inner.map(looped))
 }
 
-/// The source that a path is, or what is there instead and what to do.
+/// Recognises the source at a path; the error names what is there instead and what to do.
 fn recognise(path: &Path) -> Result<SourceName, SourceError> {
     let error = |problem: String| Err(name_error(path.as_os_str(), &problem));
     let kind = match std::fs::metadata(path) {
@@ -261,13 +261,13 @@ fn recognise(path: &Path) -> Result<SourceName, SourceError> {
     }
 }
 
-/// Whether a name reads like `kind:place`, whose kind is then wrong, and not like a path.
+/// Whether a name reads like `kind:place` with an unknown kind, and not like a path.
 fn has_kind(name: &Path) -> bool {
     let name = name.to_string_lossy();
     name.split_once(':').is_some_and(|(kind, _)| !kind.is_empty() && !kind.contains(['/', '.']))
 }
 
-/// A path that leads nowhere, and what may have been meant: the number or the device of a camera is often tried.
+/// The error of a path that does not exist, with a hint: the number or the device of a camera is often tried.
 fn no_path(path: &Path) -> SourceError {
     let name = path.to_string_lossy();
     let number = name.strip_prefix("/dev/video").unwrap_or(&name);
@@ -282,7 +282,7 @@ fn no_path(path: &Path) -> SourceError {
     SourceError::NoPath { path: name.into_owned(), hint }
 }
 
-/// The error of a file whose name ends as a video's does, with the command that makes a folder of it.
+/// The error of a file with the extension of a video, with the command that converts it to a folder.
 fn video(path: &Path) -> SourceError {
     let (video, frames) = (quoted(path), quoted(&path.with_extension("frames")));
     let command = format!(
@@ -292,7 +292,7 @@ fn video(path: &Path) -> SourceError {
     SourceError::Video { path: path.to_string_lossy().into_owned(), command }
 }
 
-/// What to do with a file that is named instead of a folder.
+/// Advice for a file that is named instead of a folder.
 fn what_a_file_is(path: &Path) -> String {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
     let folder = folder.unwrap_or(Path::new("."));
@@ -312,12 +312,12 @@ fn what_a_file_is(path: &Path) -> String {
     format!("this is a file; name a folder with a recording; sources are {SOURCE_FORMS}")
 }
 
-/// A path as an argument of a shell.
+/// Quotes a path for a shell.
 fn quoted(path: &Path) -> String {
     format!("'{}'", path.display().to_string().replace('\'', "'\\''"))
 }
 
-/// What was looked for in a folder that holds no recording, and what is there.
+/// Describes what was searched for in a folder without a recording, and what was found.
 fn nothing_known_in(folder: &Path) -> String {
     let entries = entries(folder);
     let inner = entries.iter().filter(|path| path.is_dir()).find_map(|p| SourceName::of_folder(p));
@@ -356,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_is_recognised_by_what_is_in_it() {
+    fn a_folder_is_recognised_by_its_contents() {
         let root = tempfile::tempdir().unwrap();
         let make = |file: &str| {
             let path = root.path().join(file);
@@ -387,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn files_say_what_to_do_with_them() {
+    fn errors_for_files_say_what_to_do_with_them() {
         let folder = tempfile::tempdir().unwrap();
         for (name, words) in [
             ("it's.MP4", "by its name this is a video"),
@@ -408,7 +408,7 @@ mod tests {
     }
 
     #[test]
-    fn who_means_a_camera_is_told_how_it_is_named() {
+    fn a_path_that_may_mean_a_camera_gets_a_hint() {
         let told = |name: &str| no_path(Path::new(name)).to_string();
         assert!(told("0").contains("no such file or folder: 0; a camera is named v4l:0 "));
         assert!(told("/dev/video12").contains(": /dev/video12; a camera is named v4l:12 "));

@@ -1,8 +1,8 @@
 //! Frames that another program sends: `stream:PATH`, a socket that any program may write frames to, and `ros2:TOPIC`,
 //! for which `semidense-bridge` is started.
 //!
-//! A sender that is late, silent or gone is a state, as with a camera that is unplugged. The newest frame wins; what a
-//! sender says is checked before it is believed.
+//! A late, silent or missing sender is a state, like an unplugged camera. The newest frame wins; everything that a
+//! sender sends is checked before it is used.
 
 mod feed;
 pub mod format;
@@ -27,39 +27,39 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// The program that reads ROS 2 topics.
 const BRIDGE: &str = "semidense-bridge";
-/// What to do where it is missing.
+/// What to do if it is missing.
 pub const INSTALL_BRIDGE: &str = "install the package semidense-bridge (`apt install ./semidense-bridge_*.deb`), or build it \
      with `cargo build --release -p semidense-bridge`";
 /// Its command that writes the images of a topic to its standard output.
 const BRIDGE_COMMAND: &str = "ros2-camera";
-/// Most frames that are taken at a look: a sender that never pauses must not keep capture from its other work.
+/// Maximum number of frames taken at a time: a sender that never pauses must not keep capture from its other work.
 const MAX_FRAMES_A_LOOK: usize = 8;
 
-/// Frames of another program, rectified: the newest that there is, without end.
+/// Frames of another program, rectified: an endless source of the newest frame.
 pub struct StreamSource {
     name: String,
-    /// Before `feed`: a program ends when its stream is closed.
+    /// Before `feed`, so dropped first: a program ends when its stream is closed.
     stream: Option<UnixStream>,
     feed: Feed,
     reader: FrameReader,
     rectifier: Rectifier,
     held: Option<(StreamHeader, FrameStamp)>,
-    /// The picture of the frame that is held.
+    /// The picture of the held frame.
     picture: Vec<u8>,
     numbers: FrameNumbers,
     losses: FrameLosses,
     notice: Option<Notice>,
-    /// Why the last sender was sent away.
+    /// Why the last sender was disconnected.
     fault: Option<String>,
     stall_s: f64,
-    /// When the last frame came, or its sender.
+    /// When the last frame arrived, or its sender connected.
     newest_nanos: i64,
     last_nanos: Option<i64>,
     refused_in_a_row: u32,
     has_streamed: bool,
 }
 
-/// Frames that a program sends to the socket at `path`; `stall_s`: silence that counts as absence.
+/// Receives frames that a program sends to the socket at `path`; `stall_s`: silence that counts as absence, seconds.
 pub fn open_socket(
     path: &Path,
     rig: Option<&Path>,
@@ -69,7 +69,7 @@ pub fn open_socket(
     StreamSource::new(name, Feed::Socket(Listener::new(path.to_owned())), rig, stall_s)
 }
 
-/// Images of a ROS 2 topic, by way of `semidense-bridge`.
+/// Receives the images of a ROS 2 topic through `semidense-bridge`.
 pub fn open_ros2(
     topic: &str,
     rig: Option<&Path>,
@@ -80,7 +80,7 @@ pub fn open_ros2(
     StreamSource::new(name, Feed::Program(Program::new(bridge(), arguments)), rig, stall_s)
 }
 
-/// The program beside this one, else the one on the path.
+/// The program next to this one, else the one on `PATH`.
 fn bridge() -> PathBuf {
     let beside = std::env::current_exe().ok().map(|own| own.with_file_name(BRIDGE));
     beside.filter(|path| path.is_file()).unwrap_or_else(|| PathBuf::from(BRIDGE))
@@ -129,7 +129,7 @@ impl StreamSource {
         SourceError::Camera { name: self.name.clone(), reason }
     }
 
-    /// Takes a sender that has come, and all that it has sent; what that came to.
+    /// Takes a sender that has connected, and everything that it has sent; returns the outcome.
     fn look(&mut self, now: i64) -> Result<Arrival, SourceError> {
         match self.feed.connect(now) {
             Ok(Some(stream)) => self.take_sender(stream, now),
@@ -161,7 +161,7 @@ impl StreamSource {
         now.saturating_sub(self.newest_nanos) as f64 > self.stall_s * 1e9
     }
 
-    /// One sender at a time: another is taken in the place of one that has gone silent.
+    /// One sender at a time: another only replaces one that has gone silent.
     fn take_sender(&mut self, stream: UnixStream, now: i64) {
         if self.stream.is_some() && !self.is_silent(now) {
             self.remark("another program wants to send frames too; it is refused".to_owned());
@@ -177,7 +177,7 @@ impl StreamSource {
         self.notice = Some(Notice { text: format!("{}: {text}", self.name), is_warning: true });
     }
 
-    /// Takes every frame that is whole and holds the newest good one.
+    /// Reads every complete frame and holds the newest valid one.
     fn drain(&mut self) -> Result<(), SourceError> {
         for _ in 0..MAX_FRAMES_A_LOOK {
             let Some(stream) = &mut self.stream else { return Ok(()) };
@@ -199,7 +199,7 @@ impl StreamSource {
         Ok(())
     }
 
-    /// Closes the stream. A sender that is at fault, and not just gone, is named until another comes.
+    /// Closes the stream. A sender's fault, unless it just disconnected, is reported until another sender connects.
     fn send_away(&mut self, fault: Option<String>) {
         self.stream = None;
         self.feed.disconnected(nanos_of(ClockId::Monotonic));
@@ -209,12 +209,12 @@ impl StreamSource {
         self.fault = fault;
     }
 
-    /// A frame is whole: it takes the place of one that nobody has read.
+    /// Holds a complete frame, in place of one that was not read.
     fn hold(&mut self, header: StreamHeader) {
         let arrival_nanos = nanos_of(ClockId::Monotonic);
         self.newest_nanos = arrival_nanos;
         self.fault = None;
-        // Losses are differences: the lower half of the number tells them.
+        // Losses are differences: the lower half of the number suffices.
         let (sequence, missing) = self.numbers.number(header.sequence as u32);
         self.losses.missing += missing;
         let (capture_nanos, clocks) = stamp_of(&header, arrival_nanos, nanos_of(ClockId::Realtime));
@@ -241,8 +241,8 @@ impl StreamSource {
     }
 }
 
-/// The stamp that capture goes by, and the instant by this machine's clocks. A stamp of the wall clock is moved to
-/// CLOCK_MONOTONIC by what the two show as the frame arrives.
+/// Returns the stamp that capture uses, and the instant by this machine's clocks. A wall-clock stamp is converted to
+/// CLOCK_MONOTONIC by the difference between the two when the frame arrives.
 fn stamp_of(header: &StreamHeader, arrival_nanos: i64, realtime_nanos: i64) -> (i64, FrameClocks) {
     let stamp = header.stamp_nanos;
     let to_realtime = realtime_nanos.saturating_sub(arrival_nanos);
@@ -311,7 +311,7 @@ impl FrameSource for StreamSource {
     }
 
     fn skip_to(&mut self, _sequence: u64) -> Result<(), SourceError> {
-        // A sender's numbers begin with whoever takes them.
+        // A sender's numbers start anew with every receiver.
         Ok(())
     }
 

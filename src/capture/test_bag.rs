@@ -10,18 +10,18 @@ const CHUNK: u8 = 6;
 const STATISTICS: u8 = 11;
 const DATA_END: u8 = 15;
 
-/// What every file begins and ends with.
+/// First and last bytes of every file.
 const MAGIC: &[u8] = b"\x89MCAP0\r\n";
 
-/// A file that grows.
+/// A bag under construction.
 pub struct TestBag {
     /// The file so far.
     pub bytes: Vec<u8>,
-    /// Records of the chunk that is open.
+    /// Records of the open chunk.
     pub chunk: Vec<u8>,
     /// Schemas and channels, which the summary repeats.
     summary: Vec<u8>,
-    /// Messages of each channel.
+    /// Number of messages of each channel.
     counts: Vec<(u16, u64)>,
 }
 
@@ -46,7 +46,7 @@ impl Default for TestBag {
 }
 
 impl TestBag {
-    /// Adds a topic; its channel is its place in the order of topics, from 1.
+    /// Adds a topic; its channel is its position among the topics, from 1.
     pub fn topic(&mut self, topic: &str, type_name: &str) -> u16 {
         let id = self.counts.len() as u16 + 1;
         let number = id.to_le_bytes();
@@ -71,7 +71,7 @@ impl TestBag {
         }
     }
 
-    /// Writes the open chunk, as `compress` makes it; without a name it is as it is.
+    /// Writes the open chunk, compressed by `compress`; without a name it is uncompressed.
     pub fn end_chunk(&mut self, compression: &str, compress: impl FnOnce(&[u8]) -> Vec<u8>) {
         let records = std::mem::take(&mut self.chunk);
         let crc = crc32fast::hash(&records);
@@ -111,11 +111,11 @@ impl TestBag {
     }
 }
 
-/// A message that is written field by field in little-endian CDR.
+/// A message written field by field in little-endian CDR.
 pub struct Cdr(pub Vec<u8>);
 
 impl Cdr {
-    /// One with a header of this stamp.
+    /// Starts a message with a header of this stamp.
     pub fn stamped(nanos: i64) -> Self {
         let mut cdr = Self(vec![0, 1, 0, 0]);
         cdr.u32((nanos / 1_000_000_000) as u32);
@@ -189,7 +189,7 @@ pub fn compressed_image(nanos: i64, format: &str, data: &[u8]) -> Vec<u8> {
     cdr.0
 }
 
-/// A `sensor_msgs/CameraInfo` with K = (fx, fy, cx, cy), P twice as long, and binning.
+/// A `sensor_msgs/CameraInfo` with K = (fx, fy, cx, cy), P with twice the focal lengths, and binning.
 pub fn camera_info(
     width: u32,
     height: u32,

@@ -1,6 +1,6 @@
-//! Image files for tests: a JPEG encoder that knows flat 8×8 blocks, and PNGs of every kind.
+//! Image files for tests: a JPEG encoder for flat 8×8 blocks, and PNGs of every kind.
 
-/// Bits of a JPEG scan, with a zero stuffed behind every 0xff.
+/// Bits of a JPEG scan, with a zero stuffed after every 0xff.
 #[derive(Default)]
 struct ScanBits {
     bytes: Vec<u8>,
@@ -32,8 +32,8 @@ impl ScanBits {
     }
 }
 
-/// A baseline JPEG whose 8×8 blocks are flat; `value(block_u, block_v, component)` is their level.
-/// One component is grey, three are Y Cb Cr, or R G B where `is_rgb` (an Adobe marker says so).
+/// A baseline JPEG whose 8×8 blocks are flat; `value(block_u, block_v, component)` is their level. One component is
+/// grey, three are Y Cb Cr, or R G B if `is_rgb` (declared by an Adobe marker).
 pub fn flat_block_jpeg(
     width: usize,
     height: usize,

@@ -8,14 +8,14 @@ use crate::capture::rig::Rig;
 use crate::capture::source_error::SourceError;
 use crate::slam::trajectory::StampedPose;
 
-/// The list of the images, by which the layout is known.
+/// The list of the images, by which the layout is recognised.
 pub const FRAME_LIST: &str = "rgb.txt";
 
-/// The camera of a folder, where no rig is named: `camera.txt`, see [`Rig::read_camera_txt`].
+/// The camera of a folder, if no rig is named: `camera.txt`, see [`Rig::read_camera_txt`].
 pub const CAMERA_FILE: &str = "camera.txt";
 
-/// Opens the recording in `folder`; without `rig` its `camera.txt` serves. `depth.txt` and
-/// `groundtruth.txt` may be missing.
+/// Opens the recording in `folder`; without `rig`, its `camera.txt` is used. `depth.txt` and `groundtruth.txt` may be
+/// missing.
 pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError> {
     let frame_list = folder.join(FRAME_LIST);
     let frames = read_images(folder, &frame_list)?;
@@ -28,13 +28,13 @@ pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError>
     Recording::new(contents, &rig, rig_path, frame_list)
 }
 
-/// The camera that the folder itself brings, and where it says so; `None` where it does not.
+/// Returns the folder's own camera and the path of its file; `None` if it cannot be read.
 pub fn own_rig(folder: &Path) -> Option<(Rig, PathBuf)> {
     let path = folder.join(CAMERA_FILE);
     Some((Rig::read_camera_txt(&path).ok()?, path))
 }
 
-/// The rig that is named, otherwise the folder's `camera.txt`; with where it was read.
+/// Reads the named rig, otherwise the folder's `camera.txt`; also returns the path of the file.
 pub fn read_rig(folder: &Path, rig: Option<&Path>) -> Result<(Rig, PathBuf), SourceError> {
     if let Some(path) = rig {
         return Ok((Rig::read(path)?, path.to_owned()));

@@ -1,13 +1,12 @@
-//! Cameras of the kernel (V4L2): named, opened, read, lost and found again.
+//! Kernel cameras (V4L2): named, opened, read, lost and found again.
 //!
-//! The kernel is spoken to directly, through the few structures of `linux/videodev2.h` in `kernel`.
-//! The crate `v4l` (0.14, last released in 2023) would need libclang at build time, and its stream
-//! cannot continue after one timeout: it gives the kernel a buffer that the kernel still has. The interface
-//! is the kernel's ABI, so nothing here ages.
+//! The kernel is called directly, through the few structures of `linux/videodev2.h` in `kernel`. The crate `v4l` (0.14,
+//! last released in 2023) would need libclang at build time, and its stream cannot continue after one timeout: it
+//! enqueues a buffer that the kernel still owns. The interface is the kernel's ABI, so nothing here ages.
 //!
-//! From the inside out: `video_device` is what a device does, `device` the kernel's; `negotiation`,
-//! `controls`, `stamps` and `pixel_format` decide about one thing each; `connection` is the
-//! camera that comes and goes, and this file makes a [`FrameSource`] of it.
+//! From the inside out: `video_device` is the interface of a device, `device` the kernel's implementation;
+//! `negotiation`, `controls`, `stamps` and `pixel_format` each decide one thing; `connection` is a camera that appears
+//! and disappears, and this file turns it into a [`FrameSource`].
 
 pub(crate) mod connection;
 mod controls;
@@ -39,18 +38,18 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 
 pub use self::pixel_format::{BrokenPicture, PixelFormat};
 
-/// How long a reader that has not waited before is made to wait at a time, milliseconds.
+/// Timeout of each wait by a reader that has not awaited the frame, milliseconds.
 pub(in crate::capture) const READ_MILLIS: u32 = 1000;
 
-/// A camera as a source of rectified frames: the newest that there is, without end.
+/// A camera as a source of rectified frames: an endless source of the newest frame.
 pub struct CameraSource<S: VideoSystem> {
     name: String,
     camera: Camera<S>,
     rectifier: Rectifier,
 }
 
-/// The camera of this name (a path, a number or udev's name), with the lens of a rig file. The camera
-/// itself is opened when a frame is awaited: it may come later.
+/// Creates the source for the camera of this name (a path, a number or udev's name), with the lens of a rig file. The
+/// camera itself is opened when a frame is awaited: it may be connected later.
 pub fn open(
     name: &str,
     rig: Option<&Path>,
@@ -90,7 +89,7 @@ impl<S: VideoSystem> CameraSource<S> {
         SourceError::Camera { name: self.name.clone(), reason }
     }
 
-    /// Converts the frame that waits; why it is none.
+    /// Converts the held frame; the error says why it is not a picture.
     fn convert(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, BrokenPicture> {
         let Some((held, grant, bytes)) = self.camera.held() else { return Ok(None) };
         self.rectifier.unpack_into(grant.format, bytes, grant.stride, pixels)?;
@@ -124,7 +123,7 @@ impl<S: VideoSystem> FrameSource for CameraSource<S> {
     }
 
     fn skip_to(&mut self, _sequence: u64) -> Result<(), SourceError> {
-        // A camera's numbers begin with whoever opens it.
+        // A camera's numbers start anew with every opening.
         Ok(())
     }
 

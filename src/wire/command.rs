@@ -1,4 +1,4 @@
-//! Questions to the mapper and its answers: never on the frame path.
+//! Requests to the mapper and its responses; never on the frame path.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -12,45 +12,45 @@ use crate::wire::open_error::{not_running, topic_error};
 use crate::wire::port::{Access, Events, Hub, OpenError, Wake, retry, wait};
 use crate::wire::topic::{MAPPER_COMMAND, service_name};
 
-/// Clients at a time: the supervisor, an operator, a network link.
+/// Maximum number of clients: the supervisor, an operator, a network link.
 const MAX_CLIENTS: usize = 4;
-/// Pause between two looks for the answer.
+/// Interval at which the client polls for the response.
 const ANSWER_PAUSE: Duration = Duration::from_millis(10);
 
-/// What can be asked of the mapper.
+/// A request to the mapper.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Command {
     /// Write the whole map to this file.
     SaveMap(PathBuf),
     /// Send the depth and the image of this keyframe on `mapper/earlier_keyframe`.
     SendKeyframe(u64),
-    /// Save the map into this folder; empty for the one that the mapper keeps it in.
+    /// Save the map to this folder; an empty path means the folder that the mapper keeps it in.
     SaveFolder(PathBuf),
-    /// Go over to the map in this folder.
+    /// Switch to the map in this folder.
     LoadFolder {
         /// The folder.
         folder: PathBuf,
-        /// Whether the camera is only located in it.
+        /// Whether the camera is only localised in it.
         read_only: bool,
     },
 }
 
-/// Why a question was not asked, not understood or not answered.
+/// Why a request was not sent, not understood or not answered.
 #[derive(Debug, thiserror::Error)]
 pub enum CommandError {
-    /// The path does not fit.
+    /// The path does not fit in a message.
     #[error("{0}: a path may have at most {PATH_BYTES} bytes")]
     PathTooLong(PathBuf),
-    /// A request that stands for nothing.
+    /// A request of an unknown kind.
     #[error("the mapper got a request that it does not know (kind {0})")]
     Unknown(u32),
     /// The transport failed.
     #[error("mapper/command: {0}")]
     Transport(String),
-    /// The mapper says no.
+    /// The mapper refused the request, or failed to carry it out.
     #[error("mapper: {0}")]
     Refused(String),
-    /// No answer came.
+    /// No response arrived.
     #[error("the mapper did not answer within {0:?}")]
     NoAnswer(Duration),
 }
@@ -59,7 +59,7 @@ fn failed(error: impl std::fmt::Display) -> CommandError {
     CommandError::Transport(error.to_string())
 }
 
-/// Text as the bytes of a message, cut at a character where it is too long.
+/// Encodes text for a message, truncated at a character boundary if it is too long.
 pub fn text_bytes(text: &str) -> ([u8; TEXT_BYTES], u32) {
     let mut length = text.len().min(TEXT_BYTES);
     while !text.is_char_boundary(length) {
@@ -70,7 +70,7 @@ pub fn text_bytes(text: &str) -> ([u8; TEXT_BYTES], u32) {
     (bytes, length as u32)
 }
 
-/// The text of a message; what is not UTF-8 or a control character is replaced.
+/// Decodes the text of a message; invalid UTF-8 and control characters are replaced.
 pub fn text_from_bytes(bytes: &[u8; TEXT_BYTES], length: u32) -> String {
     let length = (length as usize).min(TEXT_BYTES);
     let text = String::from_utf8_lossy(&bytes[..length]);
@@ -96,7 +96,7 @@ fn request_of(command: &Command) -> Result<CommandRequest, CommandError> {
     Ok(request)
 }
 
-/// What a request asks for; its numbers are checked, never believed.
+/// Decodes a request; its numbers are checked, never trusted.
 pub fn command_of(request: &CommandRequest) -> Result<Command, CommandError> {
     use std::os::unix::ffi::OsStrExt;
     let length = (request.path_bytes as usize).min(PATH_BYTES);
@@ -138,7 +138,7 @@ fn service(hub: &Hub, name: &str) -> Result<Factory, OpenError> {
     }
 }
 
-/// The mapper's side.
+/// The mapper's end.
 #[derive(Debug)]
 pub struct CommandServer {
     server: Server<ipc::Service, CommandRequest, (), CommandResponse, ()>,
@@ -146,7 +146,7 @@ pub struct CommandServer {
 }
 
 impl CommandServer {
-    /// Opens it.
+    /// Opens the server.
     pub fn open(hub: &Hub) -> Result<Self, OpenError> {
         let name = service_name(&hub.place.instance, MAPPER_COMMAND);
         let server =
@@ -154,12 +154,12 @@ impl CommandServer {
         Ok(Self { server, events: hub.events(&name)? })
     }
 
-    /// Its wake-ups, for [`wait`].
+    /// Events that wake the server, for [`wait`].
     pub fn events(&self) -> &Events {
         &self.events
     }
 
-    /// Answers every waiting question with what `act` makes of it.
+    /// Answers every pending request with the result of `act`.
     pub fn answer(
         &self,
         mut act: impl FnMut(Command) -> Result<(), String>,
@@ -178,7 +178,7 @@ impl CommandServer {
     }
 }
 
-/// The side of those who ask.
+/// The client's end.
 #[derive(Debug)]
 pub struct CommandClient {
     client: Client<ipc::Service, CommandRequest, (), CommandResponse, ()>,
@@ -186,7 +186,7 @@ pub struct CommandClient {
 }
 
 impl CommandClient {
-    /// Opens it.
+    /// Opens the client.
     pub fn open(hub: &Hub) -> Result<Self, OpenError> {
         let name = service_name(&hub.place.instance, MAPPER_COMMAND);
         let client =
@@ -194,7 +194,7 @@ impl CommandClient {
         Ok(Self { client, wake: hub.notifier(&name)? })
     }
 
-    /// Asks and waits for the answer; `is_alive` says whether there is still someone to answer.
+    /// Sends a request and waits for the response, until `timeout` has passed or `is_alive` returns false.
     pub fn ask(
         &self,
         command: &Command,
@@ -226,7 +226,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_command_survives_the_way() {
+    fn a_command_survives_the_round_trip() {
         let command = Command::SaveMap(PathBuf::from("/tmp/map.bin"));
         assert_eq!(command_of(&request_of(&command).unwrap()).unwrap(), command);
         let folder = Command::SaveFolder(PathBuf::from("/var/lib/semidense/map"));
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_requests_are_refused() {
+    fn malformed_requests_are_truncated_or_refused() {
         let mut request = request_of(&Command::SaveMap(PathBuf::from("/tmp/x"))).unwrap();
         request.path_bytes = u32::MAX;
         assert!(command_of(&request).is_ok(), "a length is cut, never believed");
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn texts_are_cut_at_a_character() {
+    fn texts_are_truncated_at_a_character_boundary() {
         let (bytes, length) = text_bytes(&"ä".repeat(TEXT_BYTES));
         assert_eq!(length as usize, TEXT_BYTES);
         assert_eq!(text_from_bytes(&bytes, length), "ä".repeat(TEXT_BYTES / 2));

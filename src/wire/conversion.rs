@@ -1,6 +1,6 @@
-//! The checked conversion between messages and the types of `slam`. An invalid message gives an error.
+//! Checked conversion between messages and the types of `slam`; an invalid message is an error.
 //!
-//! Going out and back in keeps every bit: lockstep and replay must agree to the last digit.
+//! A round trip preserves every bit: lockstep and replay must agree to the last digit.
 
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
@@ -20,30 +20,30 @@ use crate::wire::message::{
     RigidMessage, SimilarityMessage,
 };
 
-/// Farthest a sent quaternion may be from unit length: rounding, not another transform.
+/// Largest deviation of a received quaternion from unit length: allows for rounding, not for a different transform.
 const QUATERNION_TOLERANCE: f64 = 1e-6;
 
-/// Variances in the upper triangle of a covariance of six numbers.
+/// Indices of the variances in the upper triangle of a 6 × 6 covariance.
 const DIAGONAL: [usize; 6] = [0, 6, 11, 15, 18, 20];
 
-/// A message that cannot be what it says.
+/// Why a message is invalid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum MessageError {
-    /// A code that stands for nothing.
+    /// An unknown code.
     #[error("{field} has the unknown code {code}")]
     UnknownCode {
-        /// Where.
+        /// The field.
         field: &'static str,
         /// The code.
         code: u32,
     },
-    /// NaN, infinity, a quaternion that is none, a scale that is not positive.
+    /// NaN, infinity, a quaternion that is not of unit length, a scale that is not positive, an invalid covariance.
     #[error("{field} is not a valid number")]
     InvalidNumber {
-        /// Where.
+        /// The field.
         field: &'static str,
     },
-    /// Size and intrinsics that no camera has.
+    /// An invalid image size or invalid intrinsics.
     #[error("size {width} × {height} and intrinsics are not those of a camera")]
     InvalidIntrinsics {
         /// Width in pixels.
@@ -51,18 +51,18 @@ pub enum MessageError {
         /// Height in pixels.
         height: u32,
     },
-    /// The payload has another length than the header says.
+    /// The length of the payload differs from the one that the header announces.
     #[error("payload has {length} elements where {expected} are announced")]
     WrongLength {
-        /// Elements that came.
+        /// Elements received.
         length: usize,
-        /// Elements that should have come.
+        /// Elements expected.
         expected: usize,
     },
-    /// A point outside the image.
+    /// A point outside the image or with non-finite values.
     #[error("point {index} lies outside the image or is not finite")]
     InvalidPoint {
-        /// Its place in the payload.
+        /// Its index in the payload.
         index: usize,
     },
     /// Depth and image of different keyframes.
@@ -75,14 +75,14 @@ pub enum MessageError {
     },
 }
 
-/// The message of a rigid transform.
+/// Converts a rigid transform to its message.
 pub fn rigid_message(transform: &SE3) -> RigidMessage {
     let [x, y, z, w] = transform.quaternion_xyzw();
     let t = &transform.translation;
     [x, y, z, w, t.x, t.y, t.z]
 }
 
-/// The rigid transform of a message, bit for bit.
+/// Converts a message to its rigid transform, bit for bit.
 pub fn rigid_from_message(
     message: &RigidMessage,
     field: &'static str,
@@ -98,13 +98,13 @@ pub fn rigid_from_message(
     Ok(SE3 { rotation, translation: Vector3::new(tx, ty, tz) })
 }
 
-/// The message of a similarity.
+/// Converts a similarity to its message.
 pub fn similarity_message(similarity: &Sim3) -> SimilarityMessage {
     let [x, y, z, w, tx, ty, tz] = rigid_message(&similarity.rigid);
     [x, y, z, w, tx, ty, tz, similarity.scale]
 }
 
-/// The similarity of a message, bit for bit.
+/// Converts a message to its similarity, bit for bit.
 pub fn similarity_from_message(
     message: &SimilarityMessage,
     field: &'static str,
@@ -115,7 +115,7 @@ pub fn similarity_from_message(
     Some(similarity).filter(Sim3::is_valid).ok_or(MessageError::InvalidNumber { field })
 }
 
-/// The intrinsics of a header, checked.
+/// Returns the intrinsics of a header, checked.
 fn intrinsics_from(values: &[f64; 4], width: u32, height: u32) -> Result<Intrinsics, MessageError> {
     let [fx, fy, cx, cy] = *values;
     let intrinsics = Intrinsics { fx, fy, cx, cy, width: width as usize, height: height as usize };
@@ -123,7 +123,7 @@ fn intrinsics_from(values: &[f64; 4], width: u32, height: u32) -> Result<Intrins
     valid.ok_or(MessageError::InvalidIntrinsics { width, height })
 }
 
-/// The frame of a message with its intrinsics.
+/// Returns the frame of a message and its intrinsics, checked.
 pub fn frame_from_message<'a>(
     header: &FrameHeader,
     pixels: &'a [u8],
@@ -144,7 +144,7 @@ pub fn frame_from_message<'a>(
     Ok((frame, intrinsics))
 }
 
-/// State and reason as codes: a reason's is its place in its enumeration.
+/// Returns the codes of a state and its reason; the code of a reason is its position in its enumeration.
 pub fn codes_from_state(state: TrackingState) -> (u32, u32) {
     match state {
         TrackingState::Initializing => (0, 0),
@@ -154,7 +154,7 @@ pub fn codes_from_state(state: TrackingState) -> (u32, u32) {
     }
 }
 
-/// The state of two codes.
+/// Returns the state for a pair of codes.
 pub fn state_from_codes(state: u32, reason: u32) -> Result<TrackingState, MessageError> {
     Ok(match (state, reason) {
         (0, 0) => TrackingState::Initializing,
@@ -174,7 +174,7 @@ pub fn state_from_codes(state: u32, reason: u32) -> Result<TrackingState, Messag
     })
 }
 
-/// Every [`StartFrame`], in the order of their codes from 1.
+/// Every [`StartFrame`] in the order of the codes, from 1.
 const START_FRAMES: [StartFrame; 8] = [
     StartFrame::Begun,
     StartFrame::Dark,
@@ -186,18 +186,18 @@ const START_FRAMES: [StartFrame; 8] = [
     StartFrame::LittleParallax,
 ];
 
-/// What a frame came to in a start, as a code.
+/// Returns the code of a frame's outcome in a start; 0 for `None`.
 pub fn code_from_start_frame(frame: Option<StartFrame>) -> u32 {
     let place = frame.and_then(|frame| START_FRAMES.iter().position(|known| *known == frame));
     place.map_or(0, |place| place as u32 + 1)
 }
 
-/// What a frame came to in a start, from its code; `None` for 0 and for a code that stands for nothing.
+/// Returns a frame's outcome in a start from its code; `None` for 0 and for an unknown code.
 pub fn start_frame_from_code(code: u32) -> Option<StartFrame> {
     START_FRAMES.get((code as usize).checked_sub(1)?).copied()
 }
 
-/// The state of a map as a code.
+/// Returns the code of a map's state.
 pub fn code_from_map_state(state: MapState) -> u32 {
     match state {
         MapState::Established => 1,
@@ -205,7 +205,7 @@ pub fn code_from_map_state(state: MapState) -> u32 {
     }
 }
 
-/// The state of a map from its code.
+/// Returns the state of a map from its code.
 pub fn map_state_from_code(code: u32) -> Result<MapState, MessageError> {
     match code {
         1 => Ok(MapState::Established),
@@ -214,22 +214,22 @@ pub fn map_state_from_code(code: u32) -> Result<MapState, MessageError> {
     }
 }
 
-/// When a pose was published and what it took.
+/// When a pose was published, and how long the steps to it took.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct PoseTiming {
     /// `realtime_nanos` of the frame.
     pub realtime_nanos: i64,
     /// CLOCK_MONOTONIC at publication.
     pub published_nanos: i64,
-    /// From the frame's instant to publication.
+    /// From the frame's `clock_nanos` to publication.
     pub latency_nanos: u64,
-    /// Time that tracking took.
+    /// Tracking time.
     pub track_nanos: u64,
-    /// From the sending of the frame to the tracker's look at it.
+    /// From sending the frame to the tracker picking it up.
     pub wake_nanos: u64,
 }
 
-/// The message of a pose.
+/// Converts a pose to its message.
 pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
     let (state, reason) = codes_from_state(pose.state);
     let (quality, velocity) = (&pose.quality, pose.velocity.as_ref());
@@ -271,7 +271,7 @@ pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
     }
 }
 
-/// The pose of a message, checked.
+/// Converts a message to its pose, checked.
 pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageError> {
     let finite = |field, values: &[f64]| {
         let all = values.iter().all(|x| x.is_finite());
@@ -326,7 +326,7 @@ pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageE
     })
 }
 
-/// The velocity in a pose's message, checked; `None` where it says that there is none.
+/// Returns the velocity in a pose's message, checked; `None` if the message has none.
 fn velocity_from_message(message: &PoseMessage) -> Result<Option<Velocity>, MessageError> {
     let covariance = message.velocity_covariance;
     let [linear, angular] = [message.linear_velocity, message.angular_velocity];
@@ -341,7 +341,7 @@ fn velocity_from_message(message: &PoseMessage) -> Result<Option<Velocity>, Mess
     }
 }
 
-/// The header of a keyframe's depth.
+/// Returns the header of a keyframe's depth.
 pub fn keyframe_header(keyframe: &Keyframe) -> KeyframeHeader {
     let k = &keyframe.intrinsics;
     KeyframeHeader {
@@ -362,7 +362,7 @@ pub fn keyframe_header(keyframe: &Keyframe) -> KeyframeHeader {
     }
 }
 
-/// The header of a keyframe's image.
+/// Returns the header of a keyframe's image.
 pub fn keyframe_image_header(keyframe: &Keyframe) -> KeyframeImageHeader {
     KeyframeImageHeader {
         keyframe_id: keyframe.keyframe_id,
@@ -373,7 +373,7 @@ pub fn keyframe_image_header(keyframe: &Keyframe) -> KeyframeImageHeader {
     }
 }
 
-/// The keyframe of its two messages, checked to the last point.
+/// Assembles a keyframe from its two messages, checked to the last point.
 pub fn keyframe_from_messages(
     header: &KeyframeHeader,
     points: &[DepthPoint],
@@ -416,7 +416,7 @@ pub fn keyframe_from_messages(
     })
 }
 
-/// The covariance of common errors of depth from its upper triangle, checked.
+/// Returns the covariance of the errors that all depth of a keyframe shares, from its upper triangle, checked.
 pub fn mode_covariance_from_message(
     upper_triangle: &[f64; 6],
 ) -> Result<ModeCovariance, MessageError> {
@@ -424,7 +424,7 @@ pub fn mode_covariance_from_message(
         .ok_or(MessageError::InvalidNumber { field: "mode_covariance" })
 }
 
-/// The covariance of a keyframe's place from its upper triangle, checked.
+/// Returns the covariance of a keyframe's pose and unit from its upper triangle, checked.
 pub fn place_covariance_from_message(
     upper_triangle: &[f64; PLACE_ENTRIES],
 ) -> Result<PlaceCovariance, MessageError> {
@@ -451,7 +451,7 @@ pub fn check_points(points: &[DepthPoint], intrinsics: &Intrinsics) -> Result<()
     }
 }
 
-/// The message of a keyframe's pose.
+/// Converts a keyframe's pose to its message.
 pub fn keyframe_pose_message(pose: &KeyframePose) -> KeyframePoseMessage {
     KeyframePoseMessage {
         keyframe_id: pose.keyframe_id,
@@ -460,7 +460,7 @@ pub fn keyframe_pose_message(pose: &KeyframePose) -> KeyframePoseMessage {
     }
 }
 
-/// The pose of a keyframe from its message, checked.
+/// Converts a message to a keyframe's pose, checked.
 pub fn keyframe_pose_from_message(
     message: &KeyframePoseMessage,
 ) -> Result<KeyframePose, MessageError> {

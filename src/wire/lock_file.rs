@@ -1,4 +1,4 @@
-//! Files that one process holds at a time.
+//! Lock files, each held by one process at a time.
 
 use std::fs::{self, File};
 use std::io::{self, Read, Seek, Write};
@@ -10,27 +10,27 @@ use rustix::fs::FlockOperation;
 use rustix::io::Errno;
 use rustix::thread::Timespec;
 
-/// Permissions of a file that is the user's alone.
+/// Permissions of a file for its user alone.
 pub(in crate::wire) const USER_ALONE: u32 = 0o600;
 
-/// The lock on a file whose content is the id of the process that holds it. The kernel ends it with the process.
+/// A lock on a file that contains the id of the process holding it. The kernel releases it when the process ends.
 #[derive(Debug)]
 pub struct LockFile {
     _file: File,
     path: PathBuf,
 }
 
-/// What came of an attempt to lock.
+/// Outcome of an attempt to lock.
 #[derive(Debug)]
 pub enum Locking {
-    /// It is ours.
+    /// This process holds the lock.
     Locked(LockFile),
-    /// Another process holds it: its id, where it has been written already.
+    /// Another process holds it: its id, if already written.
     HeldBy(String),
 }
 
 impl LockFile {
-    /// Locks the file of this name, which is made with the permissions `mode`. Does not wait.
+    /// Locks the file at `path`, creating it with the permissions `mode`. Does not wait.
     pub fn take(path: &Path, mode: u32) -> io::Result<Locking> {
         loop {
             let mut file = open_lock(path, mode)?;
@@ -43,7 +43,7 @@ impl LockFile {
                 }
                 Err(error) => return Err(error.into()),
             }
-            // The one before may have removed the file between our opening and our lock.
+            // The previous holder may have removed the file between our open and our lock.
             if is_same_file(&file, path) {
                 file.set_len(0)?;
                 file.rewind()?;
@@ -56,14 +56,14 @@ impl LockFile {
 
 impl Drop for LockFile {
     fn drop(&mut self) {
-        // While it is still locked, so that no other process can hold the same name. A file that cannot be removed
-        // locks nobody out.
+        // Removed while still locked, so that no other process can hold the same name. A file that cannot be removed
+        // locks no process out.
         drop(fs::remove_file(&self.path));
     }
 }
 
-/// Opens and locks the file that has this name in the end: whoever held it before may have removed it, and others
-/// lock the new one. `None` if that is not possible in time.
+/// Opens and locks the file that finally has this name: its previous holder may have removed it, and other processes
+/// lock the new one. `None` if the lock is not obtained by `end`.
 pub(in crate::wire) fn lock_named(
     path: &Path,
     operation: FlockOperation,
@@ -80,9 +80,9 @@ pub(in crate::wire) fn lock_named(
     }
 }
 
-/// Tries to lock until `end`; whether it is locked.
+/// Tries to lock until `end`; returns whether it succeeded.
 pub(in crate::wire) fn lock_until(file: &File, operation: FlockOperation, end: Instant) -> bool {
-    /// Between two attempts.
+    /// Pause between two attempts.
     const PAUSE: Timespec = Timespec { tv_sec: 0, tv_nsec: 2_000_000 };
     loop {
         if rustix::fs::flock(file, operation).is_ok() {
@@ -91,7 +91,7 @@ pub(in crate::wire) fn lock_until(file: &File, operation: FlockOperation, end: I
         if Instant::now() >= end {
             return false;
         }
-        // Interrupted or not, the end decides.
+        // Whether the sleep was interrupted does not matter: `end` decides.
         drop(rustix::thread::nanosleep(&PAUSE));
     }
 }

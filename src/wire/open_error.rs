@@ -1,4 +1,4 @@
-//! Why a process cannot take part in an instance, in words that say what to do.
+//! Why a process cannot take part in an instance, and what to do about it.
 
 use crate::wire::folders::SHARED_MEMORY;
 use crate::wire::place::Place;
@@ -8,18 +8,18 @@ use crate::wire::topic::WIRE_VERSION;
 /// Why a process cannot take part.
 #[derive(Debug, thiserror::Error)]
 pub enum OpenError {
-    /// The place is not right.
+    /// The place cannot be used.
     #[error(transparent)]
     Place(#[from] PlaceError),
-    /// iceoryx2 cannot make a node there.
+    /// iceoryx2 cannot create a node there.
     #[error("cannot join the instance in {root}: {reason}")]
     Node {
         /// Folder.
         root: String,
-        /// What iceoryx2 says.
+        /// Error of iceoryx2.
         reason: String,
     },
-    /// Nobody offers this topic.
+    /// No process offers this topic.
     #[error(
         "nothing is running as instance `{instance}` in {root}: start `semidense run`, or name another with --instance"
     )]
@@ -29,7 +29,7 @@ pub enum OpenError {
         /// Folder.
         root: String,
     },
-    /// It runs, and its topics cannot be opened from here.
+    /// The instance runs, but its topics cannot be opened from here.
     #[error(
         "instance `{instance}` runs (process {holder}), but its shared memory is not in {SHARED_MEMORY}: it is just starting, or this container has a {SHARED_MEMORY} of its own (docker run --ipc=host shares the host's)"
     )]
@@ -39,7 +39,7 @@ pub enum OpenError {
         /// One of its processes.
         holder: String,
     },
-    /// The instance is another version's.
+    /// The instance has a different wire version.
     #[error(
         "instance `{instance}` speaks wire version {found}, this program {WIRE_VERSION}: stop the old one, or use programs of one version"
     )]
@@ -49,16 +49,16 @@ pub enum OpenError {
         /// Its version.
         found: u32,
     },
-    /// As many subscribe to the topic as it has places for.
+    /// The topic has no room for another subscriber.
     #[error(
         "topic {topic} has its {subscribers} subscribers: stop one of {holders}, or read what one of them passes on"
     )]
     TooManySubscribers {
         /// Its name.
         topic: String,
-        /// Places that it has.
+        /// Maximum number of subscribers.
         subscribers: usize,
-        /// The processes that have them.
+        /// Processes that subscribe to it.
         holders: String,
     },
     /// A topic cannot be opened.
@@ -66,13 +66,13 @@ pub enum OpenError {
     Topic {
         /// Its name.
         topic: String,
-        /// What iceoryx2 says.
+        /// Error of iceoryx2.
         reason: String,
     },
 }
 
 impl OpenError {
-    /// Whether nobody offers the topic, as far as can be seen from here.
+    /// Whether no process offers the topic, as far as can be seen from here.
     pub fn is_absence(&self) -> bool {
         matches!(self, Self::NotRunning { .. } | Self::Elsewhere { .. })
     }
@@ -90,7 +90,7 @@ pub(in crate::wire) fn topic_error(name: &str, error: &dyn std::fmt::Display) ->
     OpenError::Topic { topic: name.to_owned(), reason: in_words(&error.to_string()) }
 }
 
-/// What iceoryx2 calls by the names of its types, with what the user can do about it.
+/// Explains an error that iceoryx2 gives by the name of a type, and says what the user can do about it.
 pub(in crate::wire) fn in_words(reason: &str) -> String {
     const CAUSES: [(&[&str], &str); 4] = [
         (
@@ -121,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_of_types_become_words() {
+    fn names_of_types_are_explained() {
         let hangs = in_words("PublishSubscribeOpenError::HangsInCreation");
         assert!(hangs.contains("--ipc=host") && hangs.ends_with("HangsInCreation)"), "{hangs}");
         let files = in_words("EventCreateError(InternalFailure)");

@@ -16,25 +16,25 @@ use crate::wire::lock_file::{LockFile, Locking, USER_ALONE, lock_named};
 use crate::wire::place_error::PlaceError;
 use crate::wire::root_folder::{is_mine, usual_root};
 
-/// Longest wait for a process that joins or tidies up: both take milliseconds, on a busy machine a second.
+/// Longest wait for a process that joins or tidies up: both take milliseconds, on a busy machine up to a second.
 const LONGEST_HOLD: Duration = Duration::from_secs(10);
 
-/// Held while a process joins, and by the last one while it clears up.
+/// Lock held while a process joins, and by the last process while it tidies up.
 pub(in crate::wire) const JOIN_LOCK: &str = ".join.lock";
 
 /// The processes of an instance, by the names under which they claim it.
 pub(in crate::wire) const MEMBERS: [&str; 3] = ["capture", "tracker", "mapper"];
 
-/// End of the name of the mapper's checkpoint, behind the instance.
+/// Suffix of the mapper's checkpoint, after the name of the instance.
 pub(in crate::wire) const CHECKPOINT_SUFFIX: &str = ".checkpoint";
 
-/// End of the name of the file with capture's place in its source, behind the instance.
+/// Suffix of the file with capture's position in its source, after the name of the instance.
 pub(in crate::wire) const POSITION_SUFFIX: &str = ".position";
 
-/// End of the name of the file that names the map which the mapper has gone over to, behind the instance.
+/// Suffix of the file that names the map which the mapper has switched to, after the name of the instance.
 pub(in crate::wire) const LOADED_MAP_SUFFIX: &str = ".map";
 
-/// End of the name of a claim's file, behind the instance and the process.
+/// Suffix of a claim's file, after the names of the instance and the process.
 pub(in crate::wire) const CLAIM_SUFFIX: &str = ".lock";
 
 /// Longest name of an instance: it is part of every topic's name.
@@ -45,16 +45,16 @@ const MAX_INSTANCE_BYTES: usize = 32;
 pub struct Place {
     /// Name of the instance, first part of every topic's name.
     pub instance: String,
-    /// Folder of sockets, locks and lists; of one user.
+    /// Folder of sockets, locks and lists; owned by one user.
     pub root: PathBuf,
-    /// First part of the names in [`SHARED_MEMORY`].
+    /// Prefix of the names in [`SHARED_MEMORY`].
     pub prefix: String,
-    /// The usual folder in the temporary one, where somebody else's is in its place.
+    /// The default folder below the temporary one, if another user's file or folder occupies it.
     pub occupied: Option<PathBuf>,
 }
 
 impl Place {
-    /// The place of `instance` below `root`, the usual folder where that is empty. Touches nothing.
+    /// Returns the place of `instance` in `root`, or in the default folder if `root` is empty. Touches no file.
     pub fn new(instance: &str, root: &str) -> Result<Self, PlaceError> {
         let allowed = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
         let named = (1..=MAX_INSTANCE_BYTES).contains(&instance.len());
@@ -77,11 +77,11 @@ impl Place {
         Ok(Self { instance: instance.to_owned(), root, prefix, occupied })
     }
 
-    /// Makes the folder, for this user alone.
+    /// Creates the folder for this user alone.
     pub fn create(&self) -> Result<(), PlaceError> {
         let io = |source| PlaceError::Io { path: self.root.clone(), source };
         DirBuilder::new().recursive(true).mode(0o700).create(&self.root).map_err(io)?;
-        // Neither the folder nor a link to it may be somebody else's.
+        // Neither the folder nor a link to it may belong to another user.
         for found in [fs::symlink_metadata(&self.root), fs::metadata(&self.root)] {
             if !is_mine(&found.map_err(io)?) {
                 return Err(PlaceError::Foreign(self.root.clone()));
@@ -90,18 +90,17 @@ impl Place {
         Ok(())
     }
 
-    /// Id of the process that claimed to be the only `process` of this instance last; it may have been killed
-    /// since.
+    /// Id of the process that last claimed to be the only `process` of this instance; it may have been killed since.
     pub fn claimant(&self, process: &str) -> Option<u32> {
         let path = self.claim_path_of(&self.instance, process);
         fs::read_to_string(path).ok()?.trim().parse().ok()
     }
 
-    /// Claims to be the only `process` of this instance; the kernel ends the claim with the process.
+    /// Claims to be the only `process` of this instance; the kernel releases the claim when the process ends.
     pub fn claim(&self, process: &str) -> Result<Claim, PlaceError> {
         raise_open_files()?;
         self.create()?;
-        // Keeps away who tidies up and would hold the lock for a moment.
+        // Keeps away a process that tidies up, which would hold the lock for a moment.
         let _joining = self.hold()?;
         let path = self.claim_path_of(&self.instance, process);
         let io = |source| PlaceError::Io { path: path.clone(), source };
@@ -114,17 +113,17 @@ impl Place {
         }
     }
 
-    /// Where the mapper keeps what it needs to continue after its death.
+    /// Path of the mapper's checkpoint, from which it continues after it was killed.
     pub fn checkpoint_path(&self) -> PathBuf {
         self.kept_path(&self.instance, CHECKPOINT_SUFFIX)
     }
 
-    /// Where the mapper keeps which map it has gone over to.
+    /// Path of the file that names the map which the mapper has switched to.
     pub fn loaded_map_path(&self) -> PathBuf {
         self.kept_path(&self.instance, LOADED_MAP_SUFFIX)
     }
 
-    /// Where capture keeps its place in the source.
+    /// Path of the file with capture's position in the source.
     pub fn position_path(&self) -> PathBuf {
         self.kept_path(&self.instance, POSITION_SUFFIX)
     }
@@ -137,20 +136,20 @@ impl Place {
         self.root.join(format!("{instance}.{process}{CLAIM_SUFFIX}"))
     }
 
-    /// Removes what processes of this instance keep for their successors. While the supervisor is claimed and
-    /// none of them runs.
+    /// Removes the files that processes of this instance keep for their successors. Only while the supervisor is
+    /// claimed and none of them runs.
     pub fn forget_run(&self) {
         for path in self.kept_files() {
-            // What cannot be removed is of another run by its key.
+            // A file that cannot be removed is recognised as another run's by its key.
             let _ = fs::remove_file(path);
         }
     }
 
-    /// Takes from the group and all others what iceoryx2 gives them: its counter of nodes is the one
-    /// segment that it makes for everybody.
+    /// Revokes the access that iceoryx2 grants to the group and to others: its counter of nodes is the only segment
+    /// that it creates for everybody.
     pub(in crate::wire) fn keep_to_user(&self) {
         for path in self.node_counters() {
-            // Another user's cannot be changed, and is not ours.
+            // Another user's counter cannot be changed, and is not ours.
             let _ = fs::set_permissions(path, fs::Permissions::from_mode(USER_ALONE));
         }
     }
@@ -160,7 +159,7 @@ impl Place {
         self.transport_files(Path::new(SHARED_MEMORY), ".global_mgmt")
     }
 
-    /// What iceoryx2 has of this place in `folder`, by the ends of the names.
+    /// Files of iceoryx2 for this place in `folder` whose names end in `suffix`.
     pub(in crate::wire) fn transport_files(
         &self,
         folder: &Path,
@@ -173,7 +172,7 @@ impl Place {
         })
     }
 
-    /// iceoryx2's configuration for this place, independent of any file that lies around.
+    /// iceoryx2's configuration for this place, independent of any configuration file.
     pub(in crate::wire) fn transport_config(&self) -> Result<Config, PlaceError> {
         let wrong = |_| PlaceError::Characters(self.root.clone());
         let mut config = Config::default();
@@ -192,7 +191,7 @@ impl Place {
         lock.ok_or(PlaceError::Held(path))
     }
 
-    /// The process id of a member of the instance that runs, by its claim.
+    /// Process id of a running member of the instance, from its claim.
     pub(in crate::wire) fn running(&self) -> Option<String> {
         MEMBERS.iter().find_map(|process| {
             let path = self.claim_path_of(&self.instance, process);
@@ -205,11 +204,10 @@ impl Place {
     }
 }
 
-/// The claim of a process to be the only one; ends when dropped.
+/// A process's claim to be the only one of its kind; released when dropped.
 pub type Claim = LockFile;
 
-/// Names in shared memory are global: folders that differ need prefixes that differ, of which none begins with
-/// another.
+/// Names in shared memory are global: different folders need different prefixes, none of which begins with another.
 fn prefix_of(root: &Path) -> String {
     if root == Path::new(SYSTEM_ROOT) {
         return "semidense_system_".to_owned();
@@ -237,12 +235,12 @@ mod tests {
     }
 
     #[test]
-    fn every_folder_has_its_prefix() {
+    fn every_folder_has_its_own_prefix() {
         let prefix = |root| Place::new("rig", root).unwrap().prefix;
         let roots = [SYSTEM_ROOT, "/tmp/a", "/tmp/b", "/run/user/1000/semidense"];
         for one in roots {
             assert!(prefix(one).starts_with("semidense_"), "{one}");
-            // What belongs to a folder is found by the beginning of its name.
+            // The files of a folder are found by the prefix of their names.
             for other in roots.into_iter().filter(|&other| other != one) {
                 assert!(!prefix(other).starts_with(&prefix(one)), "{other} is taken for {one}");
             }

@@ -1,14 +1,14 @@
-//! Why an instance cannot live at its place, in words that say what to do.
+//! Why an instance cannot use its place, and what to do about it.
 
 use std::io;
 use std::path::PathBuf;
 
 use crate::wire::folders::{MAX_ROOT_BYTES, ROOT_VARIABLE, SHARED_MEMORY};
 
-/// Why an instance cannot live there.
+/// Why an instance cannot use its place.
 #[derive(Debug, thiserror::Error)]
 pub enum PlaceError {
-    /// The name of the instance.
+    /// The name of the instance is invalid.
     #[error(
         "instance `{0}` is not a valid name: use 1 to 32 of the characters a-z, A-Z, 0-9, _ and -"
     )]
@@ -18,28 +18,28 @@ pub enum PlaceError {
         "{0}: the path of the runtime folder may have at most {MAX_ROOT_BYTES} bytes; set {ROOT_VARIABLE}"
     )]
     TooLong(PathBuf),
-    /// The folder's path has bytes that a service cannot have.
+    /// The folder's path has characters that a service cannot have.
     #[error(
         "{0}: the path of the runtime folder has characters that are not allowed; set {ROOT_VARIABLE}"
     )]
     Characters(PathBuf),
-    /// The folder belongs to someone else.
+    /// The folder belongs to another user.
     #[error("{0}: the runtime folder belongs to another user; set {ROOT_VARIABLE} to one of yours")]
     Foreign(PathBuf),
-    /// The folder or a file in it cannot be made.
+    /// The folder or a file in it cannot be created.
     #[error("{path}: {source}; set {ROOT_VARIABLE} to a folder that can be written")]
     Io {
-        /// What.
+        /// The file or folder.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
-    /// A process that joins does not get ready.
+    /// Another process does not release the lock that it holds while it joins.
     #[error(
         "{0}: another process has held this lock for ten seconds: if a semidense process is stopped (ps -o pid,stat,cmd -C semidense), continue or kill it"
     )]
     Held(PathBuf),
-    /// There is one already.
+    /// Another process already holds the claim.
     #[error(
         "{}instance `{instance}` is already running (process {holder}): stop it, or choose another name with --instance",
         part_of(process)
@@ -49,17 +49,17 @@ pub enum PlaceError {
         process: String,
         /// Instance.
         instance: String,
-        /// Process id of the one that runs.
+        /// Process id of the running one.
         holder: String,
     },
-    /// Too few files may be open at a time.
+    /// The limit of open files is too low.
     #[error(
         "only {limit} open files are allowed here, {needed} are needed: raise the limit (ulimit -n 1024, LimitNOFILE= of a systemd unit, docker run --ulimit nofile=1024)"
     )]
     OpenFiles {
         /// The limit.
         limit: u64,
-        /// What is needed.
+        /// The number needed.
         needed: u64,
     },
     /// Too little address space.
@@ -69,7 +69,7 @@ pub enum PlaceError {
     AddressSpace {
         /// The limit.
         limit_mb: u64,
-        /// What is needed.
+        /// The amount needed.
         needed_mb: u64,
     },
     /// There is no shared memory.
@@ -77,14 +77,14 @@ pub enum PlaceError {
         "{SHARED_MEMORY}: {0}: there is no shared memory here; mount a tmpfs there (a container: docker run --shm-size=128m)"
     )]
     NoSharedMemory(io::Error),
-    /// Shared memory ran out while what was promised was taken.
+    /// Shared memory ran out while the promised memory was being reserved.
     #[error(
         "{SHARED_MEMORY} is full: {missing_kb} kB of {needed_kb} kB could not be reserved; enlarge it (mount -o remount,size=…, or docker run --shm-size=…) or remove what other programs left there"
     )]
     Reservation {
-        /// Could not be had.
+        /// Could not be reserved.
         missing_kb: u64,
-        /// Were wanted.
+        /// Were to be reserved.
         needed_kb: u64,
     },
     /// Too little shared memory.
@@ -99,7 +99,7 @@ pub enum PlaceError {
     },
 }
 
-/// The process of an instance that is meant; nothing where that is the supervisor, who stands for all of it.
+/// Names the process of an instance; empty for the supervisor, which represents all of the instance.
 fn part_of(process: &str) -> String {
     if process == "supervisor" { String::new() } else { format!("{process} of ") }
 }
@@ -109,7 +109,7 @@ mod tests {
     use super::PlaceError;
 
     #[test]
-    fn who_is_second_is_told_what_runs_already() {
+    fn a_second_process_is_told_what_is_already_running() {
         let told = |process: &str| {
             let (process, instance) = (process.to_owned(), "semidense".to_owned());
             PlaceError::Taken { process, instance, holder: "7".to_owned() }.to_string()

@@ -32,22 +32,22 @@ use crate::wire::shared_memory::reserve;
 use crate::wire::topic::Topic;
 use crate::wire::version::foreign_version;
 
-/// Nodes that may open one service: our processes, observers, and the dead until they are cleaned.
+/// Nodes that may open one service: our processes, observers, and dead nodes until they are cleaned up.
 const MAX_NODES: usize = 40;
 /// Listeners and notifiers of one event: enough for every subscriber of the topic.
 const MAX_EVENT_PORTS: usize = 16;
-/// Publishers of one topic: the owner, its successor while the dead one is cleaned, a network link.
+/// Publishers of one topic: the owner, its successor until the dead owner is cleaned up, a network link.
 const MAX_PUBLISHERS: usize = 3;
-/// Most events, and the interrupt, that are waited for at a time.
+/// Maximum number of events and interrupts in one wait.
 const MAX_WAITED: usize = 8;
-/// Shared memory of a process and its connections to all topics: twice what the supervisor takes, which listens to most.
+/// Shared memory of a process and its connections to all topics: twice that of the supervisor, which listens to most.
 const JOIN_BYTES: u64 = 1 << 20;
-/// How often opening is tried while another process removes the same service.
+/// Number of attempts to open a service that another process is removing.
 const OPEN_ATTEMPTS: usize = 50;
 /// Pause between two attempts.
 const OPEN_PAUSE: Duration = Duration::from_millis(10);
 
-/// What a message is made of: its header, or an element of its payload.
+/// A part of a message: its header, or an element of its payload.
 pub trait Part: Debug + ZeroCopySend + 'static {}
 
 impl<T: Debug + ZeroCopySend + 'static> Part for T {}
@@ -73,16 +73,16 @@ pub struct ReceiveError {
 #[error("waiting for messages failed ({0})")]
 pub struct WaitError(String);
 
-/// Whether a topic that does not exist is made.
+/// Whether a missing topic is created.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
-    /// Make it: a process of the pipeline.
+    /// Create it: a process of the pipeline.
     Member,
-    /// Only open what is there: an observer.
+    /// Only open an existing one: an observer.
     Observer,
 }
 
-/// A process's membership in an instance; every port is made from it.
+/// A process's membership in an instance; every port is created from it.
 #[derive(Debug)]
 pub struct Hub {
     pub(in crate::wire) node: Node<ipc::Service>,
@@ -91,8 +91,8 @@ pub struct Hub {
 }
 
 impl Hub {
-    /// Joins the instance at `place` under the name `process`. iceoryx2 stays quiet and leaves the
-    /// signals alone; what dead processes left behind is removed.
+    /// Joins the instance at `place` under the name `process`. iceoryx2 is kept from logging and from handling signals;
+    /// what dead processes left behind is removed.
     pub fn join(place: &Place, process: &str, access: Access) -> Result<Self, OpenError> {
         raise_open_files()?;
         if access == Access::Member {
@@ -115,24 +115,24 @@ impl Hub {
             .create::<ipc::Service>()
             .map_err(|e| failed(e.to_string()))?;
         place.keep_to_user();
-        // After the node: what the dead have left was removed as it was made.
+        // After creating the node, which has removed what dead processes left behind.
         if let Some(found) = foreign_version(&config, &place.instance) {
             return Err(OpenError::Version { instance: place.instance.clone(), found });
         }
         Ok(Self { node, place: place.clone(), access })
     }
 
-    /// Removes what dead processes left behind; milliseconds, so not for a frame loop.
+    /// Removes what dead processes left behind; takes milliseconds, so not for a frame loop.
     pub fn clean_up(&self) {
         self.node.try_cleanup_dead_nodes();
     }
 
-    /// Takes all shared memory that the open ports have promised; an observer's subscriber does it by itself.
+    /// Reserves all shared memory that the open ports have promised; an observer's subscriber does so automatically.
     pub fn reserve(&self) -> Result<(), OpenError> {
         Ok(reserve(Path::new(SHARED_MEMORY), &self.place.prefix)?)
     }
 
-    /// A sender of slices of `T` with a header of `H`, at most `max_length` elements.
+    /// Creates a publisher of slices of `T` with a header of `H`, up to `max_length` elements long.
     pub fn publisher<T: Part, H: Part>(
         &self,
         topic: &Topic,
@@ -151,7 +151,7 @@ impl Hub {
         Ok(Publisher { port, wake: self.notifier(&name)?, topic: name })
     }
 
-    /// A receiver of slices of `T` with a header of `H`.
+    /// Creates a subscriber to slices of `T` with a header of `H`.
     pub fn subscriber<T: Part, H: Part>(
         &self,
         topic: &Topic,
@@ -169,7 +169,7 @@ impl Hub {
             })?;
         let events = self.events(&name)?;
         let subscriber = Subscriber { port, events, topic: name };
-        // Connects now, so that nothing sent from here on is missed.
+        // Connect now, so that no message sent from here on is missed.
         subscriber.connect();
         if self.access == Access::Observer {
             self.reserve()?;
@@ -177,13 +177,13 @@ impl Hub {
         Ok(subscriber)
     }
 
-    /// The wake-ups of the service `name`.
+    /// Creates the listener for the wake-ups of the service `name`.
     pub(in crate::wire) fn events(&self, name: &str) -> Result<Events, OpenError> {
         let listener = self.event_service(name)?.listener_builder().create();
         Ok(Events { listener: listener.map_err(|e| topic_error(name, &e))? })
     }
 
-    /// What wakes those who listen to the service `name`.
+    /// Creates the notifier that wakes the listeners of the service `name`.
     pub(in crate::wire) fn notifier(&self, name: &str) -> Result<Wake, OpenError> {
         let notifier = self.event_service(name)?.notifier_builder().create();
         Ok(Wake { notifier: notifier.map_err(|e| topic_error(name, &e))? })
@@ -203,12 +203,12 @@ impl Hub {
                 .enable_safe_overflow(true)
         };
         match self.access {
-            // An observer demands nothing: the mirror of a network link has other sizes.
+            // An observer makes no demands: the mirror of a network link has other sizes.
             Access::Observer => builder().open().map_err(|error| match error {
                 PublishSubscribeOpenError::ExceedsMaxNumberOfNodes
                 | PublishSubscribeOpenError::InsufficientPermissions
                 | PublishSubscribeOpenError::IncompatibleTypes => topic_error(name, &error),
-                // There is none, or one that its processes are making or removing, or that is not to be seen from here.
+                // The service is missing, is being created or removed by its processes, or is not visible from here.
                 _ => not_running(&self.place),
             }),
             Access::Member => retry(name, || {
@@ -257,7 +257,7 @@ pub(in crate::wire) fn retry<S, E: std::fmt::Display>(
             Ok(service) => return Ok(service),
             Err(error) if attempt == OPEN_ATTEMPTS => return Err(topic_error(name, &error)),
             Err(_) => {
-                // A pause; where it cannot be waited the attempts are over sooner.
+                // A pause; if the wait fails, the attempts only end sooner.
                 let _ = wait(&[], None, OPEN_PAUSE);
             }
         }
@@ -265,7 +265,7 @@ pub(in crate::wire) fn retry<S, E: std::fmt::Display>(
     }
 }
 
-/// Sends slices of `T` with a header of `H`, and wakes those who wait.
+/// Sends slices of `T` with a header of `H`, and wakes the listeners.
 #[derive(Debug)]
 pub struct Publisher<T: Part, H: Part> {
     port: RawPublisher<ipc::Service, [T], H>,
@@ -285,9 +285,9 @@ impl<T: Part + Copy, H: Part + Default> Publisher<T, H> {
         Ok(())
     }
 
-    /// Gives the history to those who came late.
+    /// Delivers the history to subscribers that joined late.
     pub fn serve_late_joiners(&self) {
-        // What fails here fails again, and is reported, at the next send.
+        // A failure here recurs, and is reported, at the next send.
         let _ = self.port.update_connections();
     }
 
@@ -297,7 +297,7 @@ impl<T: Part + Copy, H: Part + Default> Publisher<T, H> {
 }
 
 impl<H: Part + Default> Publisher<u8, H> {
-    /// Room for `length` bytes in shared memory, to be written in place.
+    /// Lends `length` bytes of shared memory, to be written in place.
     pub fn loan(&self, length: usize) -> Result<Loan<'_, H>, SendError> {
         let sample = self.port.loan_slice_uninit(length).map_err(|e| self.error(&e))?;
         // SAFETY: every bit pattern is a u8; the kernel or an earlier message has initialised it.
@@ -306,7 +306,7 @@ impl<H: Part + Default> Publisher<u8, H> {
     }
 }
 
-/// Bytes in shared memory that are not sent yet; dropped without sending they go back.
+/// Bytes in shared memory that have not been sent yet; returned if dropped unsent.
 #[derive(Debug)]
 pub struct Loan<'a, H: Part + Default> {
     sample: SampleMut<ipc::Service, [u8], H>,
@@ -319,7 +319,7 @@ impl<H: Part + Default> Loan<'_, H> {
         self.sample.payload_mut()
     }
 
-    /// Sends them.
+    /// Sends the bytes.
     pub fn send(mut self, header: H) -> Result<(), SendError> {
         *self.sample.user_header_mut() = header;
         self.sample.send().map_err(|e| self.publisher.error(&e))?;
@@ -337,7 +337,7 @@ pub struct Subscriber<T: Part, H: Part> {
 }
 
 impl<T: Part, H: Part> Subscriber<T, H> {
-    /// The oldest unread message.
+    /// Returns the oldest unread message.
     pub fn receive(&self) -> Result<Option<Received<T, H>>, ReceiveError> {
         let sample = self.port.receive().map_err(|e| self.error(&e))?;
         Ok(sample.map(|sample| Received { sample }))
@@ -347,8 +347,8 @@ impl<T: Part, H: Part> Subscriber<T, H> {
         ReceiveError { topic: self.topic.clone(), reason: reason.to_string() }
     }
 
-    /// The newest unread message; older ones are skipped. It holds one message at a time: a subscriber may hold no more than
-    /// the topic's `borrowed`, those that it has kept included.
+    /// Returns the newest unread message; older ones are skipped. It holds one message at a time: a subscriber may hold
+    /// no more than the topic's `borrowed`, including those that it has kept.
     pub fn newest(&self) -> Result<Option<Received<T, H>>, ReceiveError> {
         let mut newest = self.receive()?;
         while newest.is_some() && self.has_unread()? {
@@ -363,18 +363,18 @@ impl<T: Part, H: Part> Subscriber<T, H> {
         self.port.has_samples().map_err(|e| self.error(&e))
     }
 
-    /// Its wake-ups, for [`wait`].
+    /// Events that wake the subscriber, for [`wait`].
     pub fn events(&self) -> &Events {
         &self.events
     }
 
     fn connect(&self) {
-        // What fails here fails again, and is reported, at the first receive.
+        // A failure here recurs, and is reported, at the first receive.
         let _ = self.port.update_connections();
     }
 }
 
-/// A message in shared memory; its place is free again when this is dropped.
+/// A message in shared memory; its slot is free again when this is dropped.
 #[derive(Debug)]
 pub struct Received<T: Part, H: Part> {
     sample: Sample<ipc::Service, [T], H>,
@@ -398,7 +398,7 @@ pub struct Events {
     listener: Listener<ipc::Service>,
 }
 
-/// Readable while a wake-up is unread: for a poll of one's own; [`wait`] takes the wake-ups.
+/// Readable while a wake-up is unread, for the caller's own poll; [`wait`] consumes the wake-ups.
 impl AsFd for Events {
     fn as_fd(&self) -> BorrowedFd<'_> {
         // SAFETY: the descriptor is the listener's and lives as long as it.
@@ -406,7 +406,7 @@ impl AsFd for Events {
     }
 }
 
-/// Wakes those who listen.
+/// Wakes the listeners of a topic.
 #[derive(Debug)]
 pub(in crate::wire) struct Wake {
     notifier: Notifier<ipc::Service>,
@@ -419,8 +419,8 @@ impl Wake {
     }
 }
 
-/// Waits until one of `events` wakes, one of `interrupts` is readable, or `timeout` is over. It may also
-/// return early: the caller looks at its ports and its clock.
+/// Waits until one of `events` wakes, one of `interrupts` is readable, or `timeout` has passed. It may also return
+/// early: the caller checks its ports and its clock.
 pub fn wait<'a>(
     events: &[&'a Events],
     interrupts: impl IntoIterator<Item = BorrowedFd<'a>>,
@@ -450,7 +450,7 @@ pub fn wait<'a>(
         Ok(_) | Err(rustix::io::Errno::INTR) => {}
         Err(e) => return Err(WaitError(e.to_string())),
     }
-    // Their number does not matter: messages are counted by themselves.
+    // The number of wake-ups does not matter: messages are counted separately.
     for event in events {
         let _ = event.listener.try_wait(|_| {});
     }

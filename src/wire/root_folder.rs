@@ -1,4 +1,4 @@
-//! Where the files of an instance lie when nobody says: the folder that all processes of a user find.
+//! The default folder for the files of an instance, found by all processes of a user.
 
 use std::fs;
 use std::io;
@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 
 use crate::wire::folders::{ROOT_VARIABLE, SYSTEM_ROOT};
 
-/// What the environment names, else systemd's runtime folder, else for the user of the services theirs, else the
-/// user's own, else one in the temporary folder; there with the name that somebody else has taken.
+/// Returns the folder named by the environment, else systemd's runtime folder, else the services' if this user owns it,
+/// else the user's, else one in the temporary folder; then also the default name if another one was chosen.
 pub(in crate::wire) fn usual_root() -> (PathBuf, Option<PathBuf>) {
     let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty());
     if let Some(root) = variable(ROOT_VARIABLE).or_else(|| variable("RUNTIME_DIRECTORY")) {
@@ -18,7 +18,7 @@ pub(in crate::wire) fn usual_root() -> (PathBuf, Option<PathBuf>) {
     if is_my_folder(Path::new(SYSTEM_ROOT)) {
         return (PathBuf::from(SYSTEM_ROOT), None);
     }
-    // After `su` or `sudo` it may name the folder of the user before.
+    // After `su` or `sudo` it may name the previous user's folder.
     if let Some(folder) = variable("XDG_RUNTIME_DIR").map(PathBuf::from)
         && is_my_folder(&folder)
     {
@@ -27,17 +27,17 @@ pub(in crate::wire) fn usual_root() -> (PathBuf, Option<PathBuf>) {
     private_root(&std::env::temp_dir())
 }
 
-/// This user's folder in `temporary`, where anybody may make one of any name first: of the names
-/// `semidense-UID`, `semidense-UID-1` and so on the first that is ours, so that all our processes find the
-/// same, else the first that is free. Also the usual name, where somebody else has taken it.
+/// Returns this user's folder in `temporary`, where any user may create one of any name first: of the names
+/// `semidense-UID`, `semidense-UID-1` and so on the first that is ours, so that all our processes find the same one,
+/// else the first that is free. Also returns the default name if a different one was chosen.
 fn private_root(temporary: &Path) -> (PathBuf, Option<PathBuf>) {
-    /// Names that are tried; who takes more does it on purpose.
+    /// Names to try; a user who takes more does so on purpose.
     const NAMES: usize = 20;
     let user = rustix::process::geteuid().as_raw();
     let usual = temporary.join(format!("semidense-{user}"));
     let numbered = (1..NAMES).map(|n| temporary.join(format!("semidense-{user}-{n}")));
     let names: Vec<PathBuf> = std::iter::once(usual.clone()).chain(numbered).collect();
-    // Without following a link: it could lead anywhere.
+    // Links are not followed: one could lead anywhere.
     let is_ours =
         |path: &&PathBuf| fs::symlink_metadata(path).is_ok_and(|found| is_private(&found));
     let is_free = |path: &&PathBuf| {
@@ -49,12 +49,12 @@ fn private_root(temporary: &Path) -> (PathBuf, Option<PathBuf>) {
     (root, occupied)
 }
 
-/// Whether this user owns what was found.
+/// Whether this user owns the file or folder.
 pub(in crate::wire) fn is_mine(found: &fs::Metadata) -> bool {
     found.uid() == rustix::process::geteuid().as_raw()
 }
 
-/// Whether it is a folder of this user in which nobody else can write.
+/// Whether it is a folder of this user that no other user can write to.
 fn is_private(found: &fs::Metadata) -> bool {
     const WRITABLE_BY_OTHERS: u32 = 0o022;
     found.is_dir() && is_mine(found) && found.mode() & WRITABLE_BY_OTHERS == 0
@@ -73,7 +73,7 @@ mod tests {
         let user = rustix::process::geteuid().as_raw();
         let name = |suffix: &str| folder.path().join(format!("semidense-{user}{suffix}"));
         assert_eq!(private_root(folder.path()), (name(""), None));
-        // A link that somebody made, a file, a folder that everybody may write to.
+        // A link, a file, a folder that any user may write to.
         symlink(folder.path(), name("")).unwrap();
         fs::write(name("-1"), "").unwrap();
         fs::create_dir(name("-2")).unwrap();
@@ -81,7 +81,7 @@ mod tests {
         let expected = (name("-3"), Some(name("")));
         assert_eq!(private_root(folder.path()), expected);
         DirBuilder::new().mode(0o700).create(name("-3")).unwrap();
-        // It is found again, also when a name before it is free again.
+        // It is found again, even once an earlier name is free.
         fs::remove_file(name("")).unwrap();
         assert_eq!(private_root(folder.path()), expected);
     }

@@ -1,4 +1,4 @@
-//! Shared memory: what is free, and taking what has been promised.
+//! Shared memory: how much is free, and reserving what segments have promised.
 
 use std::fs::{self, OpenOptions};
 use std::io;
@@ -14,8 +14,8 @@ use crate::wire::place_error::PlaceError;
 use crate::wire::root_folder::is_mine;
 
 impl Place {
-    /// Checks that shared memory has `needed` bytes left, and the address space room for them: what is
-    /// missing is not an error later but the death of the process.
+    /// Checks that `needed` bytes of shared memory are free, and that the address space has room for them: running out
+    /// later is not an error but the death of the process.
     pub fn check_shared_memory(&self, needed: u64) -> Result<(), PlaceError> {
         check_address_space(needed)?;
         let none = |cause| PlaceError::NoSharedMemory(io::Error::from(cause));
@@ -28,24 +28,24 @@ impl Place {
     }
 }
 
-/// What is free of shared memory, bytes.
+/// Free shared memory, bytes.
 pub fn free_shared_memory() -> rustix::io::Result<u64> {
     let stat = rustix::fs::statvfs(SHARED_MEMORY)?;
     Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
 }
 
-/// Takes what the segments whose names begin with `prefix` in `folder` have promised and not got: they are made
-/// sparse, and a page that is not there when it is touched ends the process (SIGBUS). Milliseconds for what is new,
-/// a fraction of one where all is taken.
+/// Reserves the memory that segments in `folder` with names that begin with `prefix` have promised but not allocated:
+/// they are created sparse, and touching a page that cannot be allocated kills the process (SIGBUS). Takes milliseconds
+/// for new segments, a fraction of one if all is reserved.
 pub(in crate::wire) fn reserve(folder: &Path, prefix: &str) -> Result<(), PlaceError> {
-    /// What `st_blocks` counts in.
+    /// Unit of `st_blocks`.
     const BLOCK_BYTES: u64 = 512;
     let (mut needed, mut missing) = (0, 0);
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
         if !entry.file_name().to_string_lossy().starts_with(prefix) {
             continue;
         }
-        // Segments come and go: one that is gone needs nothing. Anybody may put a file with such a name there.
+        // Segments appear and disappear: one that is gone needs nothing. Any user may create a file of such a name.
         let Ok(found) = entry.metadata() else { continue };
         if !found.is_file() || !is_mine(&found) {
             continue;
@@ -54,7 +54,7 @@ pub(in crate::wire) fn reserve(folder: &Path, prefix: &str) -> Result<(), PlaceE
         if lacks == 0 {
             continue;
         }
-        // Written only: a segment that is being made may be open for nothing else.
+        // Write only: a segment that is being created may be open for nothing else.
         let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
         let open = OpenOptions::new().write(true).custom_flags(flags).open(entry.path());
         let Some(file) = open.ok().filter(|file| file.metadata().is_ok_and(|m| m.is_file())) else {
@@ -62,7 +62,7 @@ pub(in crate::wire) fn reserve(folder: &Path, prefix: &str) -> Result<(), PlaceE
         };
         needed += lacks;
         let taken = rustix::fs::fallocate(&file, FallocateFlags::KEEP_SIZE, 0, found.len());
-        // A file system that cannot reserve leaves it as it was.
+        // A file system that cannot reserve leaves the segment unchanged.
         if taken == Err(rustix::io::Errno::NOSPC) {
             missing += lacks;
         }
@@ -82,8 +82,8 @@ mod tests {
     use std::fs::File;
 
     #[test]
-    fn what_segments_promise_is_taken() {
-        // The kernel's own tmpfs, under names that no process of ours has.
+    fn memory_promised_by_segments_is_reserved() {
+        // The kernel's own tmpfs, under names that none of our processes has.
         let prefix = format!("semidense-reserve-test-{}-", std::process::id());
         let segment = Path::new(SHARED_MEMORY).join(format!("{prefix}x"));
         let foreign = Path::new(SHARED_MEMORY).join(format!("x{prefix}"));
@@ -99,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pipe_with_the_name_of_a_segment_is_passed_over() {
+    fn a_pipe_with_the_name_of_a_segment_is_skipped() {
         let folder = tempfile::tempdir().unwrap();
         let pipe = std::ffi::CString::new(folder.path().join("x_pipe").to_str().unwrap()).unwrap();
         rustix::fs::mkfifoat(rustix::fs::CWD, &pipe, rustix::fs::Mode::from(0o600)).unwrap();
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn too_little_shared_memory_is_said() {
+    fn too_little_shared_memory_is_an_error() {
         let place = Place::new("rig", "/tmp/x").unwrap();
         assert!(place.check_shared_memory(0).is_ok());
         let error = place.check_shared_memory(u64::MAX).unwrap_err().to_string();

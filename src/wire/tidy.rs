@@ -1,5 +1,5 @@
-//! What a process that leaves removes from the folder of its instance and from shared memory, where nobody else is
-//! left who needs it.
+//! Removes files from the folder of an instance and from shared memory when a process leaves and no other process needs
+//! them.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -15,31 +15,31 @@ use crate::wire::place::{
     CHECKPOINT_SUFFIX, CLAIM_SUFFIX, JOIN_LOCK, LOADED_MAP_SUFFIX, MEMBERS, POSITION_SUFFIX, Place,
 };
 
-/// Longest wait before tidying up, which the next process that leaves can do as well.
+/// Longest wait before tidying up; the next process that leaves can do it as well.
 const LONGEST_TIDY_WAIT: Duration = Duration::from_secs(1);
-/// How long what a killed process has kept waits for its successor: the service manager starts one after at most
-/// five seconds, and a machine that is busy takes a few more.
+/// How long the files kept by a killed process wait for its successor: the service manager starts one within five
+/// seconds, and a busy machine takes a few more.
 const SUCCESSOR_WAIT: Duration = Duration::from_secs(30);
 
 impl Place {
-    /// Removes what iceoryx2 leaves behind on purpose when its last node is gone: its counter of
-    /// nodes and its empty folders; and what processes that were killed have left, unless a successor may still
-    /// come for it. Does nothing while anybody is here or joins.
+    /// Removes what iceoryx2 deliberately leaves behind after its last node: its counter of nodes and its empty
+    /// folders; and what killed processes left, unless a successor may still need it. While a process is present only
+    /// the remains of dead ones are removed, and while one joins nothing.
     pub fn tidy(&self) {
         let path = self.root.join(JOIN_LOCK);
-        // Waits for whoever joins or tidies up: of two that leave together, the second must look too, at what the first
-        // could not remove while the second was there. One that is stopped meanwhile leaves it to the next.
+        // Waits for a process that joins or tidies up: of two that leave together, the second must also check for what
+        // the first could not remove while it was present. If the other process is stopped, the next one tidies up.
         let end = Instant::now() + LONGEST_TIDY_WAIT;
         let alone = FlockOperation::NonBlockingLockExclusive;
         let Ok(Some(_lock)) = lock_named(&path, alone, end) else { return };
-        // What cannot be removed is removed by the next one.
+        // What cannot be removed is left to the next process.
         self.remove_dead_nodes();
         self.remove_failed_nodes();
         if !self.has_nodes() {
             self.node_counters().for_each(|path| drop(fs::remove_file(path)));
             self.remove_abandoned();
             let _ = fs::remove_dir(self.root.join("nodes"));
-            // Without a node nobody has a service open: what is left there is of the dead.
+            // Without a node no process has a service open: those left belong to dead processes.
             let _ = fs::remove_dir_all(self.root.join("services"));
             // The sockets of events.
             self.transport_files(&self.root, ".event").for_each(|path| drop(fs::remove_file(path)));
@@ -47,18 +47,18 @@ impl Place {
         }
     }
 
-    /// Whether nodes, living or dead, are below the root.
+    /// Whether there are nodes, living or dead, below the root.
     fn has_nodes(&self) -> bool {
         fs::read_dir(self.root.join("nodes")).is_ok_and(|mut nodes| nodes.next().is_some())
     }
 
-    /// Removes what killed processes have left in shared memory. Who leaves last may be the only one to do it.
+    /// Removes what killed processes left in shared memory. The last process to leave may be the only one to do so.
     fn remove_dead_nodes(&self) {
         let Ok(config) = self.transport_config() else { return };
         if !self.has_nodes() {
             return;
         }
-        // What cannot be listed or removed is removed by the next.
+        // What cannot be listed or removed is left to the next process.
         let _ = Node::<ipc::Service>::list(&config, |state| {
             if let NodeState::Dead(node) = state {
                 let _ = node.try_remove_stale_resources();
@@ -67,8 +67,8 @@ impl Place {
         });
     }
 
-    /// Removes the folders of nodes that never came to life: a start that failed leaves one without its
-    /// `.node_monitor`, and nobody could ever tell that it is dead. While nobody may join.
+    /// Removes the folders of nodes that never started: a failed start leaves one without its `.node_monitor`, which
+    /// could never be recognised as dead. Only while no process can join.
     fn remove_failed_nodes(&self) {
         let nodes = self.root.join("nodes");
         for entry in fs::read_dir(&nodes).into_iter().flatten().flatten() {
@@ -86,8 +86,8 @@ impl Place {
         }
     }
 
-    /// Removes checkpoints, positions and dead claims of instances for which no successor is waited for. While
-    /// nobody may join.
+    /// Removes checkpoints, positions and dead claims of instances that await no successor. Only while no process can
+    /// join.
     fn remove_abandoned(&self) {
         let files = self.instance_files();
         let instances: BTreeSet<&str> =
@@ -96,7 +96,7 @@ impl Place {
             instances.into_iter().filter(|instance| self.awaits_successor(instance)).collect();
         for (instance, kind, path) in &files {
             let is_needed = match kind {
-                // Its writer is dead: nobody completes it.
+                // Its writer is dead: it will not be completed.
                 Kind::Unfinished => false,
                 Kind::Kept => waiting.contains(instance.as_str()),
                 Kind::Claim => waiting.contains(instance.as_str()) || is_held(path),
@@ -107,8 +107,8 @@ impl Place {
         }
     }
 
-    /// Whether a process of `instance` may come and continue from what is kept for it: one holds its claim and has
-    /// not joined yet, or one was killed, which leaves its claim, so lately that its successor is still due.
+    /// Whether a process of `instance` may still continue from the files kept for it: one holds its claim but has not
+    /// joined yet, or one was killed, which leaves its claim, so recently that its successor is still due.
     fn awaits_successor(&self, instance: &str) -> bool {
         let claims = MEMBERS.map(|member| self.claim_path_of(instance, member));
         let mut there = claims.iter().filter(|path| path.exists()).peekable();
@@ -120,7 +120,7 @@ impl Place {
             || kept.any(|suffix| is_young(&self.kept_path(instance, suffix)))
     }
 
-    /// What processes of this instance keep for their successors.
+    /// Files that processes of this instance keep for their successors.
     pub(in crate::wire) fn kept_files(&self) -> impl Iterator<Item = PathBuf> {
         let is_ours = |(instance, kind, _): &(String, Kind, PathBuf)| {
             *instance == self.instance && matches!(kind, Kind::Kept | Kind::Unfinished)
@@ -128,13 +128,13 @@ impl Place {
         self.instance_files().into_iter().filter(is_ours).map(|(.., path)| path)
     }
 
-    /// The files of all instances in the folder, with the name of each one's instance.
+    /// The files of all instances in the folder, each with the name of its instance.
     fn instance_files(&self) -> Vec<(String, Kind, PathBuf)> {
         let entries = fs::read_dir(&self.root).into_iter().flatten().flatten();
         let described = entries.filter_map(|entry| {
             let name = entry.file_name().to_string_lossy().into_owned();
             let kind = Kind::of(&name)?;
-            // A file that is not finished begins with a dot; an instance's name has none.
+            // The name of an unfinished file begins with a dot; the name of an instance contains none.
             let instance = name.trim_start_matches('.').split('.').next()?.to_owned();
             Some((instance, kind, entry.path()))
         });
@@ -150,10 +150,10 @@ fn is_checkpoint(name: &str) -> bool {
     })
 }
 
-/// What a file of an instance is.
+/// Kind of a file of an instance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
-    /// A checkpoint, a position, or which map was gone over to.
+    /// A checkpoint, a position, or the name of the map that was switched to.
     Kept,
     /// A checkpoint that was being written.
     Unfinished,
@@ -162,7 +162,7 @@ enum Kind {
 }
 
 impl Kind {
-    /// By its name; `None` of files that are none of ours.
+    /// Returns the kind by the file's name; `None` for files that are not ours.
     fn of(name: &str) -> Option<Self> {
         if name.contains(CHECKPOINT_SUFFIX) && name.ends_with(".tmp") {
             return Some(Self::Unfinished);
@@ -177,15 +177,15 @@ impl Kind {
     }
 }
 
-/// Whether a process holds a claim. One that cannot be looked at counts as held.
+/// Whether a process holds a claim. One that cannot be opened counts as held.
 fn is_held(claim: &Path) -> bool {
     File::open(claim).map_or(true, |file| {
         rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive).is_err()
     })
 }
 
-/// Whether a file was written so lately that a successor of its writer may still come. A stamp in the future is
-/// as good as one in the past: the clock may have been set.
+/// Whether a file was written so recently that a successor of its writer may still start. A stamp in the future counts
+/// like one in the past: the clock may have been set.
 fn is_young(path: &Path) -> bool {
     let written = fs::metadata(path).and_then(|found| found.modified());
     let age = |written| {
@@ -201,7 +201,7 @@ mod tests {
     use super::*;
     use crate::wire::lock_file::{USER_ALONE, is_same_file, lock_until, open_lock};
 
-    /// A place in a folder of its own.
+    /// A place in a temporary folder.
     fn place() -> (tempfile::TempDir, Place) {
         let folder = tempfile::tempdir().unwrap();
         let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
@@ -215,14 +215,14 @@ mod tests {
         path
     }
 
-    /// Makes a file older than successors are waited for.
+    /// Makes a file older than the wait for successors.
     fn age(path: &Path) {
         let long_ago = SystemTime::now() - 2 * SUCCESSOR_WAIT;
         File::options().write(true).open(path).unwrap().set_modified(long_ago).unwrap();
     }
 
     #[test]
-    fn tidying_does_not_wait_for_ever_for_one_that_joins() {
+    fn tidying_does_not_wait_forever_for_a_process_that_joins() {
         let (folder, place) = place();
         place.create().unwrap();
         let joining = place.hold().unwrap();
@@ -240,8 +240,8 @@ mod tests {
     }
 
     #[test]
-    fn of_two_that_tidy_up_together_the_second_looks_too() {
-        /// For the second to open the file that the first removes.
+    fn of_two_that_tidy_up_together_the_second_locks_the_new_file() {
+        /// Time for the second to open the file that the first removes.
         const HOLD: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
         let (_folder, place) = place();
         place.create().unwrap();
@@ -260,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn what_killed_processes_kept_waits_for_their_successors() {
+    fn files_kept_by_killed_processes_wait_for_their_successors() {
         let (folder, place) = place();
         let kept = [place.checkpoint_path(), place.position_path(), place.loaded_map_path()];
         let other = folder.path().join("rig2.checkpoint");
@@ -270,12 +270,12 @@ mod tests {
         let unfinished = folder.path().join(".rig.checkpoint.17.tmp");
         fs::write(&unfinished, "x").unwrap();
         let claims = ["capture", "tracker", "mapper", "supervisor"].map(|p| killed(&place, p));
-        // As `status` does when it leaves while all of them wait for their restart.
+        // As `status` does on leaving while all of them await their restart.
         place.tidy();
         assert!(kept.iter().chain(&claims).all(|path| path.exists()));
         assert!(!other.exists(), "it has no process that was killed");
         assert!(!unfinished.exists());
-        // The newest of both counts: a map that does not change is written seldom.
+        // The newer of the two counts: a map that does not change is seldom written.
         age(&kept[0]);
         place.tidy();
         assert!(kept[0].exists());
@@ -285,21 +285,21 @@ mod tests {
     }
 
     #[test]
-    fn what_is_kept_waits_for_one_that_is_about_to_join() {
+    fn kept_files_wait_for_a_process_that_is_about_to_join() {
         let (_folder, place) = place();
         fs::write(place.checkpoint_path(), "x").unwrap();
         age(&place.checkpoint_path());
         let coming = place.claim("mapper").unwrap();
         place.tidy();
         assert!(place.checkpoint_path().exists());
-        // Its claim goes with it when it ends in order.
+        // An orderly end removes the claim.
         drop(coming);
         place.tidy();
         assert!(!place.checkpoint_path().exists());
     }
 
     #[test]
-    fn claims_of_the_dead_are_cleared_and_others_kept() {
+    fn claims_of_dead_processes_are_removed_and_others_kept() {
         let (folder, place) = place();
         let dead = killed(&place, "supervisor");
         fs::write(place.position_path(), "").unwrap();
@@ -320,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_failed_start_left_is_cleared() {
+    fn leftovers_of_a_failed_start_are_removed() {
         let (folder, place) = place();
         let nodes = folder.path().join("nodes");
         fs::create_dir_all(nodes.join("123")).unwrap();

@@ -1,4 +1,4 @@
-//! The table of topics: who sends what to how many, and the shared memory that takes.
+//! The table of topics: publisher, content and number of subscribers, and the shared memory that they take.
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
@@ -7,29 +7,29 @@ use crate::wire::message::{
     KeyframeImageHeader, KeyframePoseMessage, PoseMessage, StepMessage,
 };
 
-/// Version in every topic's name; counts up when a message changes.
+/// Version in every topic's name; incremented when a message changes.
 pub const WIRE_VERSION: u32 = 11;
 
-/// Most keyframes in one message of `mapper/graph`; the newest are sent when there are more.
+/// Maximum number of keyframes in one message of `mapper/graph`; if there are more, the newest are sent.
 pub const MAX_GRAPH_KEYFRAMES: usize = 4096;
 
 /// One data topic with its quality of service. Its wake-up event has the same name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Topic {
-    /// The process that sends it.
+    /// The process that publishes it.
     pub owner: &'static str,
-    /// What it carries.
+    /// Its content, as named in the topic's name.
     pub noun: &'static str,
-    /// How many may listen: our processes that do, and four observers (page, recorder, ROS 2, second machine); of what is small
-    /// more.
+    /// Maximum number of subscribers: our own processes, and four observers (page, recorder, ROS 2, second machine);
+    /// more for small messages.
     pub subscribers: usize,
-    /// Unread messages a subscriber keeps; the oldest go first.
+    /// Unread messages that a subscriber buffers; the oldest are dropped first.
     pub buffer: usize,
     /// Messages a subscriber may hold at a time.
     pub borrowed: usize,
-    /// Messages that one who comes late still gets.
+    /// Messages that a late subscriber still receives.
     pub history: usize,
-    /// Messages that the sender may write at a time.
+    /// Messages that the publisher may write at a time.
     pub loans: usize,
 }
 
@@ -43,8 +43,8 @@ pub const FRAME: Topic = Topic {
     history: 0,
     loans: 2,
 };
-/// Poses, for mapper, journal, capture, four observers, `status` and one of the user's own: small, so the buffer is deep enough
-/// that a recorder that stalls for 30 s at 30 Hz loses none.
+/// Poses, for mapper, journal, capture, four observers, `status` and one program of the user: small, so the buffer is
+/// deep enough that a recorder that stalls for 30 s at 30 Hz loses none.
 pub const POSE: Topic = Topic {
     owner: "tracker",
     noun: "pose",
@@ -54,8 +54,8 @@ pub const POSE: Topic = Topic {
     history: 1,
     loans: 2,
 };
-/// Depth of the active keyframe, for tracker, journal and four observers: only the newest counts. It is up to 1.6 MB, so that
-/// a subscriber holds one at a time: who keeps one copies it.
+/// Depth of the active keyframe, for tracker, journal and four observers: only the newest counts. It takes up to 1.6
+/// MB, so a subscriber holds one at a time and copies it to keep it.
 pub const KEYFRAME: Topic = Topic {
     owner: "mapper",
     noun: "keyframe",
@@ -67,20 +67,20 @@ pub const KEYFRAME: Topic = Topic {
 };
 /// Image of the active keyframe.
 pub const KEYFRAME_IMAGE: Topic = Topic { noun: "keyframe_image", ..KEYFRAME };
-/// Depth of a keyframe that is not the active one, for the one reader that asks for it: whenever the map's graph has another
-/// revision of it than the reader.
+/// Depth of a keyframe that is not the active one, for the one reader that requests it: whenever the map's graph has a
+/// different revision of it than the reader.
 pub const EARLIER_KEYFRAME: Topic =
     Topic { noun: "earlier_keyframe", subscribers: 1, history: 0, ..KEYFRAME };
 /// Image of that keyframe.
 pub const EARLIER_KEYFRAME_IMAGE: Topic =
     Topic { noun: "earlier_keyframe_image", ..EARLIER_KEYFRAME };
-/// Frames that are in the map, for capture, tracker, journal and three others.
+/// Frames that have entered the map, for capture, tracker, journal and three others.
 pub const STEP: Topic = Topic { owner: "mapper", noun: "step", subscribers: 6, ..POSE };
-/// Joint estimates of keyframes: some a second.
+/// Joint estimates of keyframes: a few per second.
 pub const ADJUSTMENT: Topic = Topic { owner: "mapper", noun: "adjustment", buffer: 64, ..POSE };
 /// Poses of all keyframes.
 pub const GRAPH: Topic = Topic { noun: "graph", ..KEYFRAME };
-/// Health of capture; of others it is for capture, supervisor, four observers and some that look once.
+/// Health of capture. Every health topic is for capture, supervisor, four observers and some that read it once.
 pub const CAPTURE_HEALTH: Topic = Topic {
     owner: "capture",
     noun: "health",
@@ -105,12 +105,12 @@ pub const MAPPER_COMMAND: &str = "mapper/command";
 const CHUNK_OVERHEAD_BYTES: usize = 128;
 
 impl Topic {
-    /// Messages that the sender reserves room for.
+    /// Number of messages that the publisher reserves room for.
     pub fn chunks(&self) -> usize {
         self.subscribers * (self.buffer + self.borrowed) + self.history + self.loans
     }
 
-    /// Shared memory of the topic, bytes, when one message has `message_bytes`.
+    /// Shared memory of the topic, bytes, for messages of `message_bytes`.
     pub fn bytes(&self, message_bytes: usize) -> u64 {
         (self.chunks() * (message_bytes + CHUNK_OVERHEAD_BYTES)) as u64
     }
@@ -147,7 +147,7 @@ pub fn table(intrinsics: &Intrinsics) -> Vec<(Topic, usize)> {
     ]
 }
 
-/// Shared memory that the topics of `owner` take for images of this size; of all for `None`.
+/// Shared memory of the topics of `owner`, bytes, for images of this size; of all topics for `None`.
 pub fn shared_memory_bytes(intrinsics: &Intrinsics, owner: Option<&str>) -> u64 {
     let wanted = |topic: &Topic| owner.is_none_or(|owner| topic.owner == owner);
     table(intrinsics).iter().filter(|(t, _)| wanted(t)).map(|(t, bytes)| t.bytes(*bytes)).sum()
@@ -162,13 +162,13 @@ mod tests {
     }
 
     #[test]
-    fn the_usual_camera_fits_into_the_smallest_usual_shared_memory() {
-        // 64 MiB is what a container gets.
+    fn a_common_camera_fits_into_the_smallest_common_shared_memory() {
+        // A container gets 64 MiB.
         let sum = shared_memory_bytes(&intrinsics(640, 480), None);
         assert!(sum < 64 << 20, "{sum} bytes");
         let large = shared_memory_bytes(&intrinsics(1280, 720), None);
         assert!(large < 128 << 20, "{large} bytes");
-        // As docs/operations.md and `semidense doctor` have it.
+        // The figures in docs/operations.md and of `semidense doctor`.
         assert_eq!([sum, large].map(|bytes| (bytes >> 20) + 1), [62, 101]);
     }
 

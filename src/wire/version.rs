@@ -1,5 +1,5 @@
-//! Which wire version an instance speaks: topics of another version have other names, so that programs of
-//! different versions would not hear each other without a word.
+//! The wire version of an instance: topics of another version have other names, so programs of different versions would
+//! silently not hear each other.
 
 use iceoryx2::prelude::*;
 use iceoryx2::service::Service;
@@ -12,10 +12,10 @@ fn version_of(name: &str, instance: &str) -> Option<u32> {
     version.parse().ok()
 }
 
-/// Another wire version that living processes of `instance` speak; `None` where all speak ours.
+/// Returns a different wire version that living processes of `instance` use; `None` if all use ours.
 pub(in crate::wire) fn foreign_version(config: &Config, instance: &str) -> Option<u32> {
     let mut foreign = None;
-    // What cannot be listed cannot be joined either: the caller's next step says why.
+    // Services that cannot be listed cannot be joined either: the caller's next step reports why.
     let _ = ipc::Service::list(config, |service| {
         let name = service.static_details.name().as_str();
         foreign = version_of(name, instance).filter(|&version| version != WIRE_VERSION);

@@ -1,24 +1,24 @@
-//! Why a bag or an image of it cannot be used; the file and topic are named beside it.
+//! Why a bag or an image of it cannot be used; the enclosing error names the file and topic.
 
 use crate::capture::bag::message::CdrError;
 use crate::capture::decode_error::DecodeError;
 use crate::capture::ros_image::RosImageError;
 
-/// Why a bag cannot be used, or a message of it; the file and topic are named beside it.
+/// Why a bag or a message of it cannot be used; the enclosing error names the file and topic.
 #[derive(Debug, thiserror::Error)]
 pub enum BagError {
     /// The file cannot be read.
     #[error("cannot be read: {0}; check the path and its permissions")]
     Read(#[from] std::io::Error),
-    /// Another kind of file.
+    /// Not an MCAP file.
     #[error("is not an MCAP file; write a bag as one with `ros2 bag convert` or `mcap convert`")]
     NotMcap,
-    /// A record that is not what its kind needs.
+    /// A record that is invalid for its kind.
     #[error("is damaged at byte {at}: {reason}; `mcap recover` saves what can be read")]
     Damaged {
         /// Where the record begins.
         at: u64,
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
     },
     /// No topic of images.
@@ -27,7 +27,7 @@ pub enum BagError {
     /// Several topics of images.
     #[error("has several topics with images: name one as mcap:FILE:TOPIC, of {0}")]
     SeveralTopics(String),
-    /// The named topic is not there, or has no images.
+    /// The named topic does not exist or has no images.
     #[error("has no images on the topic `{topic}`; topics with images are {known}")]
     NoTopic {
         /// The topic that was named.
@@ -35,15 +35,15 @@ pub enum BagError {
         /// Topics with images.
         known: String,
     },
-    /// Nothing says what the camera is.
+    /// No message describes the camera.
     #[error("has no CameraInfo beside `{0}`; name the camera with --rig FILE")]
     NoCamera(String),
-    /// A `CameraInfo` that no rig can be made of.
+    /// A `CameraInfo` from which no rig can be made.
     #[error("CameraInfo of `{topic}`: {reason}; name the camera with --rig FILE")]
     Camera {
         /// The topic of the images.
         topic: String,
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
     },
     /// The topic has no messages.
@@ -51,30 +51,30 @@ pub enum BagError {
     Empty(String),
 }
 
-/// An image that cannot be used; the next may be good.
+/// Why an image cannot be used; the next one may be valid.
 #[derive(Debug, thiserror::Error)]
 pub enum BagImageError {
-    /// The message is not what its type says.
+    /// The message does not match its type.
     #[error("is not a message of its type: {0}")]
     Message(#[from] CdrError),
-    /// Its pixels are of a kind that is not read, or not as many as it says.
+    /// Its pixels have an unsupported format, or their number is wrong.
     #[error("cannot be used: {0}")]
     Pixels(#[from] RosImageError),
-    /// It does not decode, or has another size than the camera's.
+    /// It cannot be decoded, or its size differs from the camera's.
     #[error(transparent)]
     Decode(#[from] DecodeError),
-    /// Its stamp does not come after that of the image before.
+    /// Its stamp is not later than that of the previous image.
     #[error("has the stamp {nanos} ns, which does not come after the one before")]
     Disordered {
         /// Its stamp.
         nanos: i64,
     },
-    /// The chunk that it was in is damaged.
+    /// The chunk that contained it is damaged.
     #[error("is lost with a part of the file that is damaged at byte {at}: {reason}")]
     Chunk {
         /// Where the record begins.
         at: u64,
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
     },
 }

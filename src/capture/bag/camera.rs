@@ -6,11 +6,11 @@ use crate::capture::bag::message::CameraInfo;
 use crate::capture::bag::topics::is_rectified;
 use crate::capture::rig::{LensModel, Rig, RigFile};
 
-/// Most coefficients of a lens that are not zero: those of the rational model after the eighth are a thin prism and a
-/// tilt, which no rig has.
+/// Maximum number of non-zero lens coefficients: those of the rational model after the eighth describe a thin prism and
+/// a tilt, which no rig has.
 const MOST_COEFFICIENTS: usize = 8;
 
-/// The rig of the camera of the images on `topic`; why there is none, in words.
+/// Returns the rig of the camera of the images on `topic`, or the reason why there is none.
 pub fn rig_of(camera: &CameraInfo, topic: &str, path: &Path) -> Result<Rig, String> {
     if camera.binning_x > 1 || camera.binning_y > 1 {
         return Err("its images are binned".to_owned());

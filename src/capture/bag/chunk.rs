@@ -1,21 +1,21 @@
-//! The content of a chunk: as it is, LZ4 or Zstandard, decoded in Rust.
+//! The content of a chunk: uncompressed, LZ4 or Zstandard, decoded in Rust.
 
 use std::io::{Error, Read, Result};
 
 use mcap::records::ChunkHeader;
 
-/// Most bytes of a chunk's content: far above what recorders write (some MB), and what one image of the largest size
-/// with four 16-bit channels needs.
+/// Maximum size of a chunk's content: far above what recorders write (a few MB), and above what one image of the
+/// largest size with four 16-bit channels needs.
 pub const MAX_CHUNK_BYTES: u64 = 1 << 30;
 
-/// Writes the content of a chunk into `content`, whose old content is dropped. It grows as bytes come, whatever size the
+/// Writes the content of a chunk into `content`, replacing its old content. It grows as bytes arrive, whatever size the
 /// header claims.
 pub fn decompress_into(header: &ChunkHeader, data: &[u8], content: &mut Vec<u8>) -> Result<()> {
     content.clear();
     if header.uncompressed_size > MAX_CHUNK_BYTES {
         return Err(Error::other(format!("a chunk of {} bytes", header.uncompressed_size)));
     }
-    // One byte more than announced tells a chunk that is longer.
+    // One byte more than announced reveals a longer chunk.
     let most = header.uncompressed_size + 1;
     match header.compression.as_str() {
         "" => content.extend_from_slice(data),

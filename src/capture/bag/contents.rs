@@ -1,4 +1,4 @@
-//! What a file holds: its topics, and of the one that is played how many images there are and the camera.
+//! Contents of a file: its topics, and the number of images and the camera of the topic that is played.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -12,21 +12,21 @@ use crate::capture::bag::topics::{
 };
 use crate::capture::rig::Rig;
 
-/// What is played of a file.
+/// The part of a file that is played.
 #[derive(Debug)]
 pub struct Contents {
     /// The topic of the images.
     pub topic: String,
-    /// Images on it.
+    /// Number of images on it.
     pub num_images: u64,
-    /// Whether the file ends before the end that a closed file has.
+    /// Whether the file lacks the end of a closed file.
     pub is_unfinished: bool,
-    /// Channels that are read: those of the images and what belongs to them.
+    /// Channels that are read: those of the images, their camera and their records.
     channels: HashMap<u16, Kind>,
 }
 
 impl Contents {
-    /// Reads the summary of a file, or all of one that has none, and chooses the topic.
+    /// Reads the summary of a file, or the whole file if it has none, and chooses the topic.
     pub fn read(path: &Path, topic: Option<&str>) -> Result<Self, BagError> {
         let mut records = Records::open(path)?;
         let summary = if records.go_to_summary()? { read_channels(&mut records)? } else { None };
@@ -59,7 +59,7 @@ impl Contents {
         Ok(Self { topic, num_images, is_unfinished, channels })
     }
 
-    /// The kind of image of a channel that is played.
+    /// Returns the kind of image of a channel that is played.
     pub fn image_kind(&self, channel: u16) -> Option<Kind> {
         self.channels.get(&channel).copied().filter(|kind| kind.is_image())
     }
@@ -69,7 +69,7 @@ impl Contents {
         self.channels.get(&channel) == Some(&Kind::FrameRecord)
     }
 
-    /// The camera by the first `CameraInfo` beside the images.
+    /// Returns the camera described by the first `CameraInfo` next to the images.
     pub fn rig(&self, path: &Path) -> Result<Rig, BagError> {
         let missing = || BagError::NoCamera(self.topic.clone());
         if !self.channels.values().any(|kind| *kind == Kind::CameraInfo) {
@@ -78,7 +78,7 @@ impl Contents {
         let mut records = Records::open(path)?;
         loop {
             let place = match records.advance() {
-                // Whatever is damaged is told when it is reached in playing.
+                // Damage is reported when playing reaches it.
                 Err(BagError::Damaged { .. }) => continue,
                 other => other?,
             };
@@ -95,7 +95,7 @@ impl Contents {
     }
 }
 
-/// The channels by the summary; `None` where that lacks them or their counts.
+/// Returns the channels in the summary; `None` if it lacks them or their counts.
 fn read_channels(records: &mut Records) -> Result<Option<Channels>, BagError> {
     let (mut channels, mut counts) = (Channels::new(), None);
     loop {
@@ -118,12 +118,12 @@ fn read_channels(records: &mut Records) -> Result<Option<Channels>, BagError> {
     Ok((!channels.is_empty()).then_some(channels))
 }
 
-/// Whether a file of this length can hold the messages that its summary counts: none is shorter than a byte.
+/// Whether a file of this length can hold the messages that its summary counts: each takes at least one byte.
 fn is_possible(channels: &Channels, length: u64) -> bool {
     channels.values().all(|channel| channel.num_messages <= length)
 }
 
-/// The channels and their messages by reading the whole file.
+/// Reads the whole file for its channels and counts their messages.
 fn count_all(records: &mut Records) -> Result<Channels, BagError> {
     let mut channels = Channels::new();
     loop {
@@ -143,7 +143,7 @@ fn count_all(records: &mut Records) -> Result<Channels, BagError> {
     }
 }
 
-/// The topic that is played.
+/// Chooses the topic to play.
 fn choose(channels: &Channels, topic: Option<&str>) -> Result<String, BagError> {
     let is_image = |channel: &&Channel| channel.kind.is_some_and(Kind::is_image);
     let with_images = || channels.values().filter(is_image).map(|channel| channel.topic.as_str());

@@ -1,4 +1,4 @@
-//! The messages of ROS 2 that are read, in CDR. Large fields stay in the file's bytes.
+//! The ROS 2 messages that are read, in CDR. Large fields borrow the file's bytes.
 
 use byteorder::{BigEndian, LittleEndian};
 use serde::Deserialize;
@@ -8,10 +8,10 @@ use crate::capture::ros_image::RosImage;
 /// Bytes before a message: encoding and options.
 const HEADER_BYTES: usize = 4;
 
-/// Why bytes are not a message.
+/// Why bytes cannot be decoded as a message.
 #[derive(Debug, thiserror::Error)]
 pub enum CdrError {
-    /// Another encoding than plain CDR.
+    /// An encoding other than plain CDR.
     #[error("its encoding is not plain CDR")]
     Encoding,
     /// They end early, or hold an invalid value.
@@ -19,7 +19,7 @@ pub enum CdrError {
     Content(#[from] cdr_encoding::Error),
 }
 
-/// The message of `bytes`; what comes after it is left alone, so that a type may stand for the start of others.
+/// Decodes a message from `bytes`; bytes after it are ignored, so that a type may be the beginning of others.
 pub fn decode<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, CdrError> {
     let Some((header, content)) = bytes.split_at_checked(HEADER_BYTES) else {
         return Err(CdrError::Encoding);
@@ -54,7 +54,7 @@ pub struct Image<'a> {
     pub height: u32,
     /// Width, pixels.
     pub width: u32,
-    /// What a pixel is.
+    /// Format of a pixel.
     pub encoding: String,
     /// Whether numbers are big endian.
     pub is_bigendian: u8,
@@ -78,7 +78,7 @@ impl Image<'_> {
 pub struct CompressedImage<'a> {
     _header: Stamped,
     _format: String,
-    /// The file.
+    /// The encoded image file.
     #[serde(with = "serde_bytes")]
     pub data: &'a [u8],
 }
@@ -100,18 +100,18 @@ pub struct CameraInfo {
     _r: [f64; 9],
     /// Projection of the rectified image, row-major 3×4.
     pub p: [f64; 12],
-    /// Columns that one pixel is of; 0 and 1 are the same.
+    /// Sensor columns per pixel; 0 and 1 mean the same.
     pub binning_x: u32,
-    /// Rows that one pixel is of.
+    /// Sensor rows per pixel.
     pub binning_y: u32,
-    /// Offset, height and width of the part of the sensor that the image is; a width of 0 is all of it.
+    /// Offset, height and width of the image's region of the sensor; a width of 0 means all of it.
     pub roi: [u32; 4],
 }
 
 /// `semidense_msgs/Frame` of our own recordings.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct FrameRecord {
-    /// That of its image.
+    /// Header of its image.
     pub header: Stamped,
     /// Number of the frame at its source.
     pub sequence: u64,

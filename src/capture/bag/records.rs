@@ -1,4 +1,4 @@
-//! The records of an MCAP file in the order of the file, those inside chunks among them.
+//! The records of an MCAP file in the order of the file, including those inside chunks.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -21,10 +21,10 @@ const END_BYTES: u64 = (PREFIX_BYTES + 20 + MAGIC.len()) as u64;
 /// Bytes of a message before its content.
 const MESSAGE_HEADER_BYTES: usize = 22;
 
-/// What the records have come to.
+/// The record that reading has reached.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Place {
-    /// A channel with its number; messages are not counted.
+    /// A channel with its number; its messages are not counted.
     Channel(u16, Channel),
     /// A message, whose content is [`Records::message`].
     Message {
@@ -33,7 +33,7 @@ pub enum Place {
         /// When it was recorded, nanoseconds.
         log_nanos: i64,
     },
-    /// How many messages each channel has.
+    /// Number of messages of each channel.
     Counts(Vec<(u16, u64)>),
 }
 
@@ -44,20 +44,20 @@ pub struct Records {
     position: u64,
     /// Bytes of the file.
     pub length: u64,
-    /// The record at hand, where it is not in the chunk; a chunk before it is decoded.
+    /// The current record, unless it lies in the chunk; also a chunk that is not decoded yet.
     raw: Vec<u8>,
-    /// The chunk at hand, and how much of it was read.
+    /// The current chunk, and how much of it has been read.
     chunk: Vec<u8>,
     chunk_position: usize,
-    /// The record at hand in the chunk; `None` where it is `raw`.
+    /// The current record in the chunk; `None` if it is `raw`.
     in_chunk: Option<Range<usize>>,
-    /// What the messages of a type are, by the type's number.
+    /// Kind of the messages of a type, by the type's number.
     kinds: HashMap<u16, Option<Kind>>,
-    /// The channel of the message at hand.
+    /// Channel of the current message.
     pub channel: u16,
-    /// Whether the end that a closed file has was reached.
+    /// Whether the end was reached, early or not.
     has_ended: bool,
-    /// Whether the file ended before that.
+    /// Whether the file ended before the end that a closed file has.
     pub is_unfinished: bool,
 }
 
@@ -88,7 +88,7 @@ impl Records {
         })
     }
 
-    /// Goes to the summary at the end of the file; false where it has none.
+    /// Seeks the summary at the end of the file; returns false if it has none.
     pub fn go_to_summary(&mut self) -> Result<bool, BagError> {
         let Some(at) = self.length.checked_sub(END_BYTES).filter(|at| *at > MAGIC.len() as u64)
         else {
@@ -116,7 +116,7 @@ impl Records {
         Ok(())
     }
 
-    /// The content of the message at hand.
+    /// Returns the content of the current message.
     pub fn message(&self) -> &[u8] {
         self.record().get(MESSAGE_HEADER_BYTES..).unwrap_or_default()
     }
@@ -132,8 +132,8 @@ impl Records {
         BagError::Damaged { at, reason: reason.to_string() }
     }
 
-    /// Continues to the next record that is read here; `None` at the end. After [`BagError::Damaged`] the next call
-    /// continues behind what is damaged.
+    /// Advances to the next record of interest; `None` at the end. After [`BagError::Damaged`] the next call continues
+    /// after the damaged part.
     pub fn advance(&mut self) -> Result<Option<Place>, BagError> {
         loop {
             let found = if self.chunk_position < self.chunk.len() {
@@ -166,7 +166,7 @@ impl Records {
         Ok(Some((opcode, self.position)))
     }
 
-    /// The next record of the file that is read; `None` at its end.
+    /// The next record of the file that is of interest; `None` at its end.
     fn next_in_file(&mut self) -> Result<Option<(u8, u64)>, BagError> {
         loop {
             let left = self.length.saturating_sub(self.position);
@@ -182,13 +182,13 @@ impl Records {
             self.file.read_exact(&mut prefix)?;
             let (opcode, length) = parse_prefix(prefix);
             if length > left - PREFIX_BYTES as u64 {
-                // Cut off: what lies before is whole.
+                // Cut off: everything before it is complete.
                 self.end_early();
                 return Ok(None);
             }
             self.position += PREFIX_BYTES as u64 + length;
             match opcode {
-                // What follows the data only repeats what it has.
+                // The records after the data only repeat it.
                 op::FOOTER | op::DATA_END => {
                     self.has_ended = true;
                     return Ok(None);
@@ -218,16 +218,16 @@ impl Records {
         self.raw.clear();
         let read = (&mut self.file).take(length).read_to_end(&mut self.raw)?;
         if (read as u64) < length {
-            // The file was cut while it was read.
+            // The file was truncated while it was read.
             self.end_early();
         }
         self.in_chunk = None;
         Ok(())
     }
 
-    /// What a record is; `None` for a chunk, whose records come next, and for what is not read.
+    /// Interprets a record; `None` for a chunk, whose records come next, and for a record of no interest.
     fn place(&mut self, opcode: u8, at: u64) -> Result<Option<Place>, BagError> {
-        // A chunk within a chunk is none.
+        // A chunk within a chunk is ignored.
         if opcode == op::CHUNK {
             return if self.in_chunk.is_none() { self.open_chunk(at) } else { Ok(None) };
         }
@@ -260,7 +260,7 @@ impl Records {
         Ok(Some(place))
     }
 
-    /// Decodes the chunk at hand.
+    /// Decodes the current chunk.
     fn open_chunk(&mut self, at: u64) -> Result<Option<Place>, BagError> {
         self.chunk_position = 0;
         let decoded = match parse_record(op::CHUNK, &self.raw) {

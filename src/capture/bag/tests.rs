@@ -43,7 +43,7 @@ fn camera_bag(num: u8) -> TestBag {
     bag
 }
 
-/// Middle pixel of every frame that can be read, and what went wrong with the others.
+/// Middle pixel of every frame that can be read, and the errors of the others.
 fn play(bag: &mut Bag) -> (Vec<(u64, u8)>, Vec<String>) {
     let (mut pixels, mut frames, mut errors) = (vec![0; PIXELS], Vec::new(), Vec::new());
     loop {
@@ -69,7 +69,7 @@ fn error_of(bytes: &[u8], topic: Option<&str>) -> String {
 }
 
 #[test]
-fn every_encoding_gives_its_grey() {
+fn every_encoding_is_converted_to_grey() {
     let pixel = |bytes: &[u8]| bytes.repeat(PIXELS);
     let red = crate::slam::image::gray::gray_from_rgb([200, 100, 50]);
     for (encoding, bytes, expected) in [
@@ -129,13 +129,13 @@ fn compressed_images_and_compressed_chunks_are_read() {
 }
 
 #[test]
-fn a_file_without_end_is_played_to_its_last_whole_chunk() {
+fn a_file_without_an_end_is_played_to_its_last_complete_chunk() {
     let whole = camera_bag(3).finish();
     let (_file, bag) = opened(&whole, None);
     let mut bag = bag.unwrap();
     assert_eq!((bag.num_frames(), bag.take_notice()), (Some(3), None));
     assert_eq!(play(&mut bag).0, [(0, 0), (1, 1), (2, 2)]);
-    // Without footer, and within the last chunk.
+    // Cut before the footer, and within the last chunk.
     let unfinished = camera_bag(3).bytes;
     for (cut, expected) in [(0, 3), (1, 2), (500, 2)] {
         let (_file, bag) = opened(&unfinished[..unfinished.len() - cut], None);
@@ -150,7 +150,7 @@ fn a_file_without_end_is_played_to_its_last_whole_chunk() {
 #[test]
 fn a_damaged_chunk_is_one_error_and_the_rest_follows() {
     let mut bytes = camera_bag(3).finish();
-    // A pixel of the second image: its chunk's checksum is wrong then.
+    // A changed pixel of the second image makes its chunk's checksum wrong.
     let run = [1; 100];
     let at = bytes.windows(100).position(|window| window == run).unwrap();
     bytes[at] = 9;
@@ -219,7 +219,7 @@ fn our_own_recordings_keep_number_stamp_and_exposure() {
 }
 
 #[test]
-fn lenses_become_rigs_or_an_error_that_says_what_to_do() {
+fn lenses_become_rigs_or_errors_that_say_what_to_do() {
     let rig = |model: &str, d: &[f64], binning| {
         let mut bag = camera_bag(0);
         bag.message(2, 1, &camera_info(WIDTH, HEIGHT, model, d, K, binning));
@@ -252,7 +252,7 @@ fn lenses_become_rigs_or_an_error_that_says_what_to_do() {
 }
 
 #[test]
-fn several_topics_none_and_no_camera_are_said() {
+fn several_topics_no_topic_and_no_camera_are_errors() {
     let mut bag = camera_bag(1);
     let right = bag.topic("/right/image_raw", IMAGE);
     bag.message(right, 1, &image(1, WIDTH, HEIGHT, "mono8", WIDTH, &[1; PIXELS]));
@@ -273,9 +273,9 @@ fn several_topics_none_and_no_camera_are_said() {
 }
 
 #[test]
-fn hostile_sizes_are_errors_and_take_no_memory() {
+fn arbitrary_sizes_are_errors_and_take_no_memory() {
     let whole = camera_bag(2).finish();
-    // Every length field claims the largest number; whatever becomes of it, it ends.
+    // Every length field claims the largest number; whatever the outcome, reading ends.
     for at in (0..whole.len()).step_by(3) {
         for length in [4, 8] {
             let mut bytes = whole.clone();
@@ -288,7 +288,7 @@ fn hostile_sizes_are_errors_and_take_no_memory() {
             }
         }
     }
-    // A chunk within a chunk within itself is not followed, and a small chunk that claims a gigabyte is refused.
+    // A chunk within a chunk is not followed.
     let mut bag = camera_bag(1);
     bag.chunk.extend(record(6, &[0; 40]));
     let (_file, bag) = opened(&bag.finish(), None);
@@ -296,7 +296,7 @@ fn hostile_sizes_are_errors_and_take_no_memory() {
 }
 
 #[test]
-fn names_of_bags_are_understood() {
+fn names_of_bags_are_parsed() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run.mcap");
     std::fs::write(&path, camera_bag(1).finish()).unwrap();

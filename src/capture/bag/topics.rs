@@ -1,8 +1,8 @@
-//! Which topics hold what.
+//! Kinds of topics, and which topics belong together.
 
 use std::collections::BTreeMap;
 
-/// What a topic's messages are, as far as they are read here.
+/// Kind of a topic's messages, among those that are read here.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// `sensor_msgs/Image`.
@@ -16,7 +16,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// The kind of a type's name, with or without `msg` in it.
+    /// Returns the kind for the name of a type, with or without `msg` in it.
     pub fn of_type(name: &str) -> Option<Self> {
         match name.replacen("/msg/", "/", 1).as_str() {
             "sensor_msgs/Image" => Some(Self::Image),
@@ -33,12 +33,12 @@ impl Kind {
     }
 }
 
-/// A channel of the file: several may have the same topic.
+/// A channel of the file; several may have the same topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Channel {
     /// Its topic.
     pub topic: String,
-    /// What its messages are; `None` for what is not read.
+    /// Kind of its messages; `None` if they are not read.
     pub kind: Option<Kind>,
     /// Messages in it.
     pub num_messages: u64,
@@ -47,7 +47,7 @@ pub struct Channel {
 /// The channels by their numbers.
 pub type Channels = BTreeMap<u16, Channel>;
 
-/// The topic of the camera that belongs to images on `topic`: `camera_info` beside it, as ROS has it.
+/// The topic of the camera that belongs to images on `topic`: by ROS convention `camera_info` next to it.
 pub fn camera_topic(topic: &str) -> String {
     beside(topic, "camera_info")
 }
@@ -62,7 +62,7 @@ fn beside(topic: &str, name: &str) -> String {
     format!("{namespace}/{name}")
 }
 
-/// Whether the images on `topic` are rectified already, by their name (`image_rect`, `image_rect_color`).
+/// Whether the images on `topic` are already rectified, judging by its name (`image_rect`, `image_rect_color`).
 pub fn is_rectified(topic: &str) -> bool {
     base_topic(topic).rsplit('/').next().is_some_and(|name| name.contains("rect"))
 }
@@ -74,7 +74,7 @@ fn base_topic(topic: &str) -> &str {
 
 /// Topics as a list for an error.
 pub fn listed<'a>(topics: impl Iterator<Item = &'a str>) -> String {
-    /// More would not be read.
+    /// A longer list would not be read.
     const MOST: usize = 20;
     let mut names: Vec<&str> = topics.collect();
     names.sort_unstable();

@@ -1,4 +1,4 @@
-//! A written dataset is what its reader gives back.
+//! A written dataset is read back unchanged.
 
 use super::*;
 use crate::capture::simulator::Simulator;
@@ -35,7 +35,7 @@ fn write(
 }
 
 #[test]
-fn the_tum_reader_gives_back_the_simulated_sequence() {
+fn the_tum_reader_reproduces_the_simulated_sequence() {
     for distortion in [vec![], vec![-0.28, 0.07, 0.0002, 0.00002]] {
         let mut simulator = simulator(distortion);
         let folder = tempfile::tempdir().unwrap();
@@ -98,7 +98,7 @@ fn a_euroc_dataset_has_body_poses_that_lead_back_to_the_camera() {
 }
 
 #[test]
-fn nothing_is_overwritten_unasked_and_nothing_else_even_when_asked() {
+fn only_a_dataset_is_replaced_and_only_on_request() {
     let simulator = simulator(vec![]);
     let folder = tempfile::tempdir().unwrap();
     let target = folder.path().join("sequence");
@@ -113,7 +113,7 @@ fn nothing_is_overwritten_unasked_and_nothing_else_even_when_asked() {
     fs::write(other.join("letter"), "dear").unwrap();
     let refused = write(&simulator, &other, DatasetLayout::Tum, true);
     assert!(matches!(refused, Err(DatasetError::NotADataset { .. })));
-    // Nothing half-written lies about.
+    // No half-written folder remains.
     let names: Vec<_> =
         fs::read_dir(folder.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
     assert_eq!(names.len(), 2, "{names:?}");

@@ -3,8 +3,8 @@
 use crate::capture::simulator::random::{Stream, mix2, unit};
 use crate::capture::simulator::texture::Texture;
 
-/// Half the width of a drawn edge, texels: two pixels from dark to light keep the texture free of
-/// steps that a sampled image would turn into stairs.
+/// Half the width of a drawn edge, texels: two pixels from dark to light keep the texture free of steps that sampling
+/// would turn into staircases.
 const EDGE_TEXELS: f32 = 1.0;
 
 /// A square of reflectances under construction.
@@ -28,7 +28,7 @@ pub enum Shape {
 }
 
 impl Shape {
-    /// Half sides of a rectangle that holds the shape.
+    /// Half sides of the rectangle around the shape.
     fn half_sides(self) -> (f32, f32) {
         match self {
             Self::Rectangle(a, b) | Self::Triangle(a, b) | Self::Ellipse(a, b) => (a, b),
@@ -65,15 +65,15 @@ impl Canvas {
         self.size as f32
     }
 
-    /// Ends the drawing; reflectances are kept within what surfaces have.
+    /// Finishes the drawing; reflectances are limited to those of real surfaces.
     pub fn into_texture(mut self) -> Texture {
         self.texels.iter_mut().for_each(|texel| *texel = texel.clamp(0.02, 0.98));
         Texture::new(self.size, self.texels)
     }
 
-    /// Adds noise of several octaves with zero mean: lattices from `cells` a side, each octave twice
-    /// as fine and `persistence` times as strong, down to two texels. `stretch` is how many times
-    /// longer the grain is along x than along y (a power of two).
+    /// Adds noise of several octaves with zero mean: lattices from `cells` per side, each octave twice as fine and
+    /// `persistence` times as strong, down to two texels. `stretch` is how many times longer the grain is along x than
+    /// along y (a power of two).
     pub fn add_noise(
         &mut self,
         seed: u64,
@@ -123,7 +123,7 @@ impl Canvas {
         (first % cells, (first + 1) % cells, t * t * t * (t * (t * 6.0 - 15.0) + 10.0))
     }
 
-    /// Paints a shape of one reflectance over what is there; `opacity` 1 hides it.
+    /// Paints a shape of one reflectance over the drawing; an `opacity` of 1 hides what is below.
     pub fn draw(
         &mut self,
         shape: Shape,
@@ -151,9 +151,9 @@ impl Canvas {
         }
     }
 
-    /// Covers the surface with `count` opaque shapes of all directions, radii from `smallest` to
-    /// `largest` texels with a density ∝ r⁻³: the dead-leaves model, whose edges, occlusions and
-    /// spectrum are those of natural images (Lee, Mumford, Huang, IJCV 2001).
+    /// Covers the surface with `count` opaque shapes of all orientations, radii from `smallest` to `largest` texels
+    /// with a density ∝ r⁻³: the dead-leaves model, whose edges, occlusions and spectrum are those of natural images
+    /// (Lee, Mumford, Huang, IJCV 2001).
     pub fn scatter_leaves(
         &mut self,
         stream: &mut Stream,

@@ -1,4 +1,4 @@
-//! Which blocks each tile of the image can see, so that a ray tests a few and not all.
+//! Finds the blocks that each tile of the image can see, so that a ray tests only a few of them.
 
 use nalgebra::Vector3;
 
@@ -6,12 +6,12 @@ use crate::capture::simulator::lens::{LANES, Lens, NEAREST_M};
 use crate::capture::simulator::scene::{Block, Scene};
 use crate::slam::geometry::se3::SE3;
 
-/// Side of a tile, pixels: a few blocks each, and few enough tiles to sort.
+/// Side of a tile, pixels: few blocks per tile, and few enough tiles to sort.
 const TILE_PX: usize = 16;
-/// Rays that are cast together have one list.
+/// Rays that are cast together share one list.
 const _: () = assert!(TILE_PX.is_multiple_of(LANES));
 
-/// A block that may be seen, and the least depth at which it may be, metres.
+/// A block that may be visible, and a lower bound on its depth, metres.
 #[derive(Debug, Clone, Copy)]
 pub struct NearBlock {
     /// Index into [`Scene::blocks`].
@@ -20,7 +20,7 @@ pub struct NearBlock {
     pub nearest: f32,
 }
 
-/// For every tile the blocks that may be seen in it, nearest first.
+/// For every tile, the blocks that may be visible in it, nearest first.
 #[derive(Debug, Default)]
 pub struct TileLists {
     columns: usize,
@@ -105,8 +105,8 @@ impl TileLists {
     }
 }
 
-/// Bounds of the rays of a tile with a pixel to spare on every side: the lens bends lines, and
-/// between two rows' poses a block moves.
+/// Bounds of the rays of a tile with a margin of a pixel on every side: the lens bends lines, and between two rows'
+/// poses a block moves.
 fn tile_bounds(
     lens: &Lens,
     columns: std::ops::Range<usize>,
@@ -132,8 +132,8 @@ fn tile_bounds(
     bounds
 }
 
-/// Grows `bounds` by the projection of the part of a block in front of the camera; returns its
-/// nearest depth, infinite where all of it is behind.
+/// Extends `bounds` by the projection of the part of a block in front of the camera; returns its nearest depth,
+/// infinite if all of it is behind.
 fn include_block(block: &Block, camera_from_world: &SE3, bounds: &mut Bounds) -> f32 {
     let (sin, cos) = block.turn;
     let corners: [Vector3<f64>; 8] = std::array::from_fn(|i| {
@@ -158,7 +158,7 @@ fn include_block(block: &Block, camera_from_world: &SE3, bounds: &mut Bounds) ->
         if from.z >= near {
             include(from);
         }
-        // The edges that cross the near plane end there.
+        // Edges that cross the near plane are clipped there.
         for to in (0..3).map(|bit| &corners[i | 1 << bit]) {
             if (from.z < near) != (to.z < near) {
                 let share = (near - from.z) / (to.z - from.z);

@@ -1,4 +1,4 @@
-//! Pixels that more than one surface fills: what share each has of them, and how bright all of it is.
+//! Pixels covered by more than one surface: the share of each, and the brightness of the whole.
 
 use crate::capture::simulator::lens::{LANES, Ray};
 use crate::capture::simulator::scene::Scene;
@@ -10,10 +10,10 @@ use crate::slam::kernel::{Floats, Instructions};
 const EDGE_GRID: usize = 4;
 /// Rays of the grid.
 const RAYS: usize = EDGE_GRID * EDGE_GRID;
-/// Shares that make sorting worthwhile.
+/// Number of shares that makes sorting worthwhile.
 const ENOUGH_SHARES: usize = 2048;
 
-/// Place of every ray of the grid in its pixel: to the right, and down.
+/// Offset of every ray of the grid in its pixel: to the right, and down.
 const PLACES: [[f32; RAYS]; 2] = {
     const STEP: f32 = 1.0 / EDGE_GRID as f32;
     let mut places = [[0.0; RAYS]; 2];
@@ -26,22 +26,22 @@ const PLACES: [[f32; RAYS]; 2] = {
     places
 };
 
-/// The part of a pixel that one surface fills.
+/// The part of a pixel that one surface covers.
 #[derive(Debug, Clone, Copy)]
 struct Share {
     surface: f32,
     /// Rays of the grid that meet it.
     count: f32,
-    /// The middle of these, and their extent.
+    /// The centre of these, and their extent.
     ray: Ray,
-    /// Place of the pixel in the image.
+    /// Index of the pixel in the image.
     pixel: usize,
 }
 
-/// Shares that wait until there are enough: those of one surface are shaded together.
+/// Shares collected until there are enough: those of one surface are shaded together.
 #[derive(Debug, Default)]
 pub struct Shares {
-    /// Those of a pixel follow one another.
+    /// The shares of a pixel are consecutive.
     shares: Vec<Share>,
     /// Surface and index of each.
     order: Vec<(u32, u32)>,
@@ -50,13 +50,13 @@ pub struct Shares {
 }
 
 impl Shares {
-    /// Whether it is time to add them to the image.
+    /// Whether there are enough to add them to the image.
     pub fn are_enough(&self) -> bool {
         self.shares.len() >= ENOUGH_SHARES
     }
 
-    /// Divides a pixel: a grid of rays counts each surface's share among the blocks `around`, which are those of the
-    /// surfaces of the pixel and its neighbours.
+    /// Divides a pixel: a grid of rays counts each surface's share, testing the blocks of the surfaces `around`, which
+    /// are those of the pixel and its neighbours.
     #[inline(always)]
     pub fn divide<I: Instructions>(
         &mut self,
@@ -95,7 +95,7 @@ impl Shares {
         }
     }
 
-    /// Adds `weight` × the mean brightness of every divided pixel to `out`; each share is sampled once, in its middle.
+    /// Adds `weight` × the mean brightness of every divided pixel to `out`; each share is sampled once, at its centre.
     #[inline(always)]
     pub fn add_to<I: Instructions>(
         &mut self,
@@ -121,7 +121,7 @@ impl Shares {
     fn shade<I: Instructions>(&mut self, lanes: I, scene: &Scene, views: &[LocalView]) {
         let Self { shares, order, greys } = self;
         order.clear();
-        // One more than the surface: none comes first.
+        // One more than the surface's number, so that no surface comes first.
         let numbered = shares.iter().zip(0..);
         order.extend(numbered.map(|(share, i)| ((share.surface + 1.0) as u32, i)));
         order.sort_unstable();
@@ -158,7 +158,7 @@ impl Share {
     }
 }
 
-/// The rays of some shares; where fewer than [`LANES`], the last one for the rest.
+/// The rays of some shares; if there are fewer than [`LANES`], the last one fills the rest.
 #[inline(always)]
 fn together<I: Instructions>(lanes: I, shares: &[Share], some: &[(u32, u32)]) -> Ray<Floats<I>> {
     let mut numbers = [[0.0; LANES]; 6];
@@ -172,7 +172,7 @@ fn together<I: Instructions>(lanes: I, shares: &[Share], some: &[(u32, u32)]) ->
     Ray { at: [x, y], du: [du_x, du_y], dv: [dv_x, dv_y] }
 }
 
-/// The different blocks among some surfaces, and how many those are.
+/// The distinct blocks of some surfaces, and their number.
 #[inline(always)]
 fn blocks_of(around: &[f32; 5]) -> ([u32; 5], usize) {
     let (mut blocks, mut count) = ([0; 5], 0);

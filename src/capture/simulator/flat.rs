@@ -19,18 +19,18 @@ use crate::capture::simulator::scene::{Builder, Cover, Furnished, Stage, picture
 
 /// Height of the rooms, metres.
 pub const HEIGHT_M: f32 = 2.7;
-/// Half of a wall between two rooms: each has its own side of it, metres.
+/// Half the thickness of a wall between two rooms, each of which has its own side, metres.
 const WALL_M: f32 = 0.1;
 /// Height of a door, metres.
 const DOOR_M: f32 = 2.1;
 /// Inner size of the four rooms along x and y, metres.
 pub const ROOM_M: [f32; 2] = [4.4, 4.0];
-/// Where the rooms A, B, C and D begin, metres.
+/// Origins of the rooms A, B, C and D, metres.
 pub const ROOMS_M: [[f32; 2]; 4] = [[0.0, 0.0], [4.6, 0.0], [4.6, 6.0], [0.0, 6.0]];
-/// Where the corridor begins and how large it is, metres.
+/// Origin and size of the corridor, metres.
 const CORRIDOR_M: ([f32; 2], [f32; 2]) = ([0.0, 4.2], [9.0, 1.6]);
 
-/// A round through all rooms. The camera looks where there is furniture, mostly across its path.
+/// A round through all rooms. The camera looks at furniture, mostly across its path.
 static ROUND: [Waypoint; 43] = [
     // A, from a step aside in front of the sofa.
     waypoint(3.0, 2.9, -100.0, -9.0),
@@ -86,7 +86,7 @@ static ROUND: [Waypoint; 43] = [
 
 static ROUTE: Route = Route { waypoints: &ROUND, turn_deg: 360.0, height_m: 1.4, rounds: 2 };
 
-/// Puts it up; the seed chooses textures and small things.
+/// Builds the flat; the seed chooses textures and small objects.
 pub fn flat(seed: u64) -> Furnished {
     let mut b = Builder::new(seed, [0.0; 3]);
     let plaster = Cover::of(Pattern::Plaster);
@@ -125,7 +125,7 @@ pub fn flat(seed: u64) -> Furnished {
     Furnished { blocks: b.blocks, stage: stage(&ROUTE) }
 }
 
-/// Where the camera stands with other motions than a walk: about the start of the route.
+/// Position of the camera for motions other than a walk: around the start of the route.
 pub fn stage(route: &'static Route) -> Stage {
     let start = &route.waypoints[0];
     Stage {
@@ -163,14 +163,14 @@ pub struct Door {
 }
 
 impl Door {
-    /// From `from` to `to` along a wall.
+    /// A door from `from` to `to` along a wall, metres.
     pub const fn new(side: Side, from: f32, to: f32) -> Self {
         Self { side, from, to }
     }
 }
 
-/// Floor, ceiling and walls with doors of a room at `origin` of the inner `size`, and its lamp; what is placed
-/// next stands in it. Covers: west, east, south, north, floor, ceiling. The doors of a wall are in order along it.
+/// Builds floor, ceiling and walls with doors of a room at `origin` with the inner `size`, and its lamp; objects placed
+/// next stand in it. Covers: west, east, south, north, floor, ceiling. The doors of a wall are in order along it.
 pub fn enclose(
     b: &mut Builder,
     origin: [f32; 2],
@@ -190,9 +190,9 @@ pub fn enclose(
     }
 }
 
-/// One wall with its doors: pieces beside them, and above each a piece; frames of wood around.
+/// Builds one wall with its doors: pieces next to them, a piece above each, and wooden frames around them.
 fn wall(b: &mut Builder, size: [f32; 2], side: Side, cover: Cover, doors: &[Door]) {
-    /// Width of a door's frame and how far it stands out of the wall, metres.
+    /// Width of a door's frame and how far it protrudes from the wall, metres.
     const FRAME_M: (f32, f32) = (0.08, 0.015);
     let is_along_x = matches!(side, Side::South | Side::North);
     let across = match side {

@@ -1,4 +1,4 @@
-//! The scenes: a furnished room, a plane, a corridor; [`flat`] and [`twins`] have rooms of their own.
+//! The scenes: a furnished room, a plane, a corridor; those with several rooms are in [`flat`] and [`twins`].
 
 use std::f32::consts::FRAC_PI_2;
 
@@ -12,7 +12,7 @@ pub fn build(kind: SceneKind, seed: u64) -> Scene {
     Scene::new(furnish(kind, seed).blocks, seed)
 }
 
-/// Puts up a scene; the seed chooses textures and small things, not where furniture stands.
+/// Furnishes a scene; the seed chooses textures and small objects, not the positions of furniture.
 pub fn furnish(kind: SceneKind, seed: u64) -> Furnished {
     match kind {
         SceneKind::Room => room(seed),
@@ -55,7 +55,7 @@ fn room(seed: u64) -> Furnished {
     Furnished { blocks: b.blocks, stage }
 }
 
-/// Rug, low table and what lies on it, dining table with chairs.
+/// Rug, low table with objects on it, dining table with chairs.
 fn room_floor(b: &mut Builder) {
     let wood = Cover::of(Pattern::Veneer);
     b.place([3.1, 2.6], 0.0, [2.4, 1.7, 0.015], 0.1, Cover::of(Pattern::Carpet));

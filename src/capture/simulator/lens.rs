@@ -1,4 +1,4 @@
-//! The rays of a raw image: where every pixel looks.
+//! The rays of a raw image: the direction of every pixel.
 
 use nalgebra::Vector2;
 use rayon::prelude::*;
@@ -6,14 +6,14 @@ use rayon::prelude::*;
 use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
-/// How many rays are cast together.
+/// Number of rays cast together.
 pub const LANES: usize = 8;
-/// A bit for each of them.
+/// A bit for each of these rays.
 pub const ALL_LANES: u32 = (1 << LANES) - 1;
-/// Nothing is seen closer than this, metres.
+/// Nearest depth that is visible, metres.
 pub const NEAREST_M: f32 = 0.05;
 
-/// A direction as `(x, y, 1)`, and how it changes from pixel to pixel; of one pixel or, as arrays, of many.
+/// A direction `(x, y, 1)` and its change from pixel to pixel; of one pixel or, as arrays, of many.
 #[derive(Debug, Clone, Copy)]
 pub struct Ray<T = f32> {
     /// x and y at z = 1.
@@ -37,7 +37,7 @@ impl Ray {
 }
 
 impl<T> Ray<T> {
-    /// The same function of every number.
+    /// Applies a function to every number.
     #[inline(always)]
     pub fn map<'a, U>(&'a self, of: impl Fn(&'a T) -> U) -> Ray<U> {
         let two = |pair: &'a [T; 2]| [of(&pair[0]), of(&pair[1])];
@@ -45,26 +45,26 @@ impl<T> Ray<T> {
     }
 }
 
-/// One ray a pixel, row by row.
+/// One ray per pixel, row by row.
 #[derive(Debug, Clone)]
 pub struct Lens {
     /// Image width, pixels.
     pub width: usize,
     /// Image height, pixels.
     pub height: usize,
-    /// `width * height` rays, and [`LANES`] without a direction behind them.
+    /// `width * height` rays, followed by [`LANES`] without a direction.
     rays: Ray<Vec<f32>>,
 }
 
 impl Lens {
-    /// The rays of a camera whose `unproject` gives x and y at z = 1 of a pixel, or `None` outside
-    /// its valid region: such a pixel sees nothing.
+    /// Computes the rays of a camera whose `unproject` returns x and y at z = 1 for a pixel, or `None` outside its
+    /// valid region: such a pixel sees nothing.
     pub fn new(
         width: usize,
         height: usize,
         unproject: impl Fn(f64, f64) -> Option<[f64; 2]> + Sync,
     ) -> Self {
-        // One pixel more on every side, so that every pixel has neighbours to both sides.
+        // One pixel more on every side, so that every pixel has neighbours on both sides.
         let wide = width + 2;
         let grid: Vec<[f64; 2]> = (0..wide * (height + 2))
             .into_par_iter()
@@ -79,7 +79,7 @@ impl Lens {
                 let (before, after) = (grid[at - step], grid[at + step]);
                 std::array::from_fn(|k| {
                     let central = 0.5 * (after[k] - before[k]);
-                    // At the rim of the valid region one side is missing.
+                    // At the border of the valid region one side is missing.
                     let sided = [central, after[k] - grid[at][k], grid[at][k] - before[k]];
                     sided.into_iter().find(|s| s.is_finite()).unwrap_or(0.0) as f32
                 })
@@ -99,7 +99,7 @@ impl Lens {
         Self { width, height, rays }
     }
 
-    /// The ray of a pixel by its place in the image, row by row.
+    /// The ray of a pixel by its index in the image, row by row.
     #[inline(always)]
     pub fn ray(&self, pixel: usize) -> Ray {
         self.rays.map(|plane| plane[pixel])

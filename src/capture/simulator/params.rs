@@ -1,4 +1,4 @@
-//! Everything that can be set about a simulated sequence.
+//! Parameters of a simulated sequence.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,14 +8,14 @@ use crate::slam::geometry::camera_model::{CameraModel, Distortion};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::parameter::{ParameterError, check_range};
 
-/// Most frames of a sequence: an hour and more at 25 Hz.
+/// Maximum number of frames of a sequence: more than an hour at 25 Hz.
 const MAX_FRAMES: usize = 100_000;
 
 /// How the camera moves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MotionKind {
-    /// A walk with the camera in the hand: swaying, turning, trembling.
+    /// A walk with a hand-held camera: swaying, turning, trembling.
     Handheld,
     /// Back and forth on a straight line across the view, without turning or tremor.
     Straight,
@@ -31,9 +31,9 @@ pub enum MotionKind {
 pub struct MotionParams {
     /// Kind of motion.
     pub kind: MotionKind,
-    /// Mean speed along the path, metres a second before `world_scale`; 0.5 is a slow walk.
+    /// Mean speed along the path, metres per second before `world_scale`; 0.5 is a slow walk.
     pub mean_speed_m_s: f64,
-    /// Mean rate of turning, degrees a second; 15 turns 300° in the default 20 s.
+    /// Mean rate of turning, degrees per second; 15 turns 300° in the default 20 s.
     pub mean_turn_deg_s: f64,
     /// Factor on the tremor of the hand (about 1.5 mm and 0.1° at 1.5 to 6 Hz); 0 is a gimbal.
     pub tremor: f64,
@@ -45,15 +45,15 @@ impl Default for MotionParams {
     }
 }
 
-/// What lens and sensor do to the light.
+/// Effects of lens and sensor on the light.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SensorParams {
     /// Standard deviation of the noise of a pixel, grey levels; 2 is a small sensor indoors.
     pub noise_std_dev: f64,
-    /// Share of the light that is lost in the image corner (∝ r⁴ from the centre); 0 is none.
+    /// Share of the light that is lost in the image corner (∝ r⁴ from the centre); 0 means none.
     pub vignette: f64,
-    /// Amplitude of the slow change of gain, as natural logarithm; 0 is a locked exposure.
+    /// Amplitude of the slow change of gain, as a natural logarithm; 0 is a locked exposure.
     pub gain_amplitude: f64,
     /// Amplitude of the slow change of offset, grey levels.
     pub offset_amplitude: f64,
@@ -87,14 +87,14 @@ impl Default for SensorParams {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimulatorParams {
-    /// What is seen.
+    /// The scene.
     pub scene: SceneKind,
     /// Chooses textures, path and noise.
     pub seed: u64,
-    /// Number of frames; all are kept in memory (307 kB each at 640 × 480). A scene that is named where this is
-    /// the default is shown as a whole, see [`SimulatorParams::with_scene`].
+    /// Number of frames; all are kept in memory (307 kB each at 640 × 480). With the default value, a scene chosen by
+    /// name is shown completely, see [`SimulatorParams::with_scene`].
     pub frames: usize,
-    /// Frames a second.
+    /// Frames per second.
     pub rate_hz: f64,
     /// Image width, pixels.
     pub width: usize,
@@ -128,21 +128,21 @@ impl Default for SimulatorParams {
 }
 
 impl SimulatorParams {
-    /// The default camera at half its resolution: the same view at a quarter of the time.
+    /// The default camera at half its resolution: the same view in a quarter of the time.
     pub fn half_size() -> Self {
         let Self { width, height, focal_px, .. } = Self::default();
         Self { width: width / 2, height: height / 2, focal_px: 0.5 * focal_px, ..Self::default() }
     }
 
-    /// The same of another scene. One with a route, as the flat, is walked through as often as shows all there is,
-    /// unless a number of frames other than the default is asked for.
+    /// Returns the same parameters with another scene. One with a route, such as the flat, is walked through as often
+    /// as it takes to show everything, unless the number of frames differs from the default.
     pub fn with_scene(mut self, scene: SceneKind) -> Self {
         self.scene = scene;
         let stage = furnish(scene, self.seed).stage;
         let speed = self.motion.mean_speed_m_s;
         if let (Some(route), true) = (stage.route, self.frames == Self::default().frames) {
             let duration_s = route.rounds as f64 * route.length_m() / speed;
-            // Out of range for a camera that hardly moves.
+            // Would be out of range for a camera that hardly moves.
             let frames = (duration_s * self.rate_hz).clamp(1.0, MAX_FRAMES as f64);
             self.frames = frames.ceil() as usize;
         }
@@ -184,7 +184,7 @@ impl SimulatorParams {
 }
 
 impl MotionParams {
-    /// Refuses values that no hand can do.
+    /// Refuses motions that no hand can make.
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("mean_speed_m_s", self.mean_speed_m_s, 0.0..=5.0)?;
         check_range("mean_turn_deg_s", self.mean_turn_deg_s, 0.0..=200.0)?;
@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn parameters_survive_toml_and_unknown_keys_do_not() {
+    fn parameters_survive_toml_and_unknown_keys_are_refused() {
         let mut params = SimulatorParams { scene: SceneKind::Corridor, ..Default::default() };
         params.sensor.distortion = vec![0.1, 0.0, 0.0, 0.0];
         let text = toml::to_string(&params).unwrap();

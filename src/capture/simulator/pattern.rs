@@ -18,9 +18,9 @@ pub enum Pattern {
     Plaster,
     /// Wallpaper with a repeated motif over a mottled ground.
     Wallpaper,
-    /// Shapes of all sizes over each other.
+    /// Overlapping shapes of all sizes.
     Picture,
-    /// The same with other shapes.
+    /// The same with fewer and larger shapes.
     Poster,
     /// Lines of printed words.
     Text,
@@ -41,7 +41,7 @@ pub enum Pattern {
 /// Draws on the ground of a pattern.
 type Draw = fn(&mut Canvas, &mut Stream);
 
-/// All patterns in the order of their discriminants: reflectance of the ground, and what is drawn on it.
+/// All patterns in the order of their discriminants: reflectance of the ground, and the function that draws on it.
 const PATTERNS: [(Pattern, f32, Draw); 12] = [
     (Pattern::Planks, 0.5, planks),
     (Pattern::Plaster, 0.66, plaster),
@@ -57,7 +57,7 @@ const PATTERNS: [(Pattern, f32, Draw); 12] = [
     (Pattern::Cover, 0.5, cover),
 ];
 
-/// Side of every texture in texels; at 2 mm a texel one tile is 2 m, and a pixel at 1 m is a texel.
+/// Side of every texture in texels; at 2 mm per texel one tile is 2 m, and a pixel at 1 m is a texel.
 pub const TEXTURE_SIZE: usize = 1024;
 
 /// Paints all textures, in parallel on the current rayon pool.
@@ -157,7 +157,7 @@ fn text(canvas: &mut Canvas, stream: &mut Stream) {
             let centre = [u + 0.5 * width, v];
             canvas.draw(Shape::Rectangle(0.5 * width, 0.5 * height), centre, 0.0, value, 0.9);
             for _ in 0..(width / 12.0) as usize {
-                // Light gaps make letters of the bar.
+                // Light gaps turn the bar into letters.
                 let gap = [u + stream.uniform(0.1, 0.9) * width, v];
                 let lean = stream.uniform(-0.5, 0.5);
                 canvas.draw(Shape::Rectangle(1.2, 0.6 * height), gap, lean, 0.8, 0.9);

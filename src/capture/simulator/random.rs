@@ -71,7 +71,7 @@ impl Default for Normal {
         let size = 1usize << Self::BITS;
         let raw: Vec<f64> =
             (0..size).map(|i| normal_quantile((i as f64 + 0.5) / size as f64)).collect();
-        // The table cuts the tails; scaling restores unit variance, and ½ makes the sum of two one.
+        // The table cuts the tails; scaling restores unit variance, and ½ makes the variance of a sum of two one.
         let variance = raw.iter().map(|q| q * q).sum::<f64>() / size as f64;
         let scale = (0.5 / variance).sqrt();
         Self { table: raw.iter().map(|q| (q * scale) as f32).collect() }

@@ -1,4 +1,4 @@
-//! Ray casting: which surface every pixel sees, how far away, and how bright.
+//! Ray casting: the surface that every pixel sees, its depth and its brightness.
 
 use crate::capture::simulator::cull::TileLists;
 use crate::capture::simulator::edges::Shares;
@@ -12,9 +12,9 @@ use crate::slam::kernel::{Body, Instructions, Kernel};
 /// Reused memory of a renderer: one for each thread.
 #[derive(Debug, Default)]
 pub struct RenderScratch {
-    /// What every pixel sees, and [`LANES`] more.
+    /// The surface that every pixel sees, and [`LANES`] more.
     surfaces: Vec<f32>,
-    /// Depth along the optical axis of every pixel, metres, infinite where nothing is; and [`LANES`] more.
+    /// Depth along the optical axis of every pixel, metres, infinite where there is no surface; and [`LANES`] more.
     depths: Vec<f32>,
     views: Vec<LocalView>,
     lists: TileLists,
@@ -24,7 +24,7 @@ pub struct RenderScratch {
 }
 
 impl RenderScratch {
-    /// Depth along the optical axis of every pixel as it was last cast, metres (0 where nothing is).
+    /// Writes the depth along the optical axis of every pixel in the last cast, metres (0 where there is no surface).
     pub fn depth_into(&self, depth: &mut [f32]) {
         for (out, &seen) in depth.iter_mut().zip(&self.depths) {
             *out = if seen.is_finite() { seen } else { 0.0 };
@@ -35,11 +35,11 @@ impl RenderScratch {
 /// Renders a scene through a lens.
 #[derive(Debug)]
 pub struct Renderer<'a> {
-    /// What is seen.
+    /// The scene.
     pub scene: &'a Scene,
-    /// Through which rays.
+    /// The rays.
     pub lens: &'a Lens,
-    /// With which instructions: all give the same bits.
+    /// The instructions: all give the same bits.
     pub kernel: Kernel,
 }
 
@@ -51,7 +51,7 @@ struct Shutter<'a> {
 }
 
 impl Renderer<'_> {
-    /// Casts the depth of every pixel, without what it sees, into `scratch`.
+    /// Casts the depth of every pixel, without its surface, into `scratch`.
     pub fn cast_depth(&self, pose: &SE3, scratch: &mut RenderScratch) {
         let shutter = Shutter { pose_of_row: &|_| *pose, is_global: true };
         self.kernel.run_eight(Casting { renderer: self, shutter, names_surfaces: false, scratch });
@@ -72,7 +72,7 @@ impl Renderer<'_> {
         self.kernel.run_eight(Shading { renderer: self, shutter, weight, scratch, grey });
     }
 
-    /// The blocks as the camera sees them when it takes a row; the same as in the last row under a global shutter.
+    /// Computes the blocks as the camera sees them when it takes a row; under a global shutter once, for the first row.
     fn view_blocks(&self, shutter: Shutter<'_>, row: usize, views: &mut Vec<LocalView>) {
         if row > 0 && shutter.is_global {
             return;
@@ -85,11 +85,11 @@ impl Renderer<'_> {
     }
 }
 
-/// Casts one ray a pixel.
+/// Casts one ray per pixel.
 struct Casting<'a> {
     renderer: &'a Renderer<'a>,
     shutter: Shutter<'a>,
-    /// Whether the surfaces are wanted too, and not only the depths.
+    /// Whether the surfaces are needed too, not only the depths.
     names_surfaces: bool,
     scratch: &'a mut RenderScratch,
 }
@@ -108,7 +108,7 @@ impl Body for Casting<'_> {
         lists.fill(renderer.scene, lens, shutter.pose_of_row, shutter.is_global);
         for v in 0..height {
             renderer.view_blocks(shutter, v, views);
-            // What is written beyond the end of a row is overwritten with the next one.
+            // Values written beyond the end of a row are overwritten with those of the next one.
             for u in (0..width).step_by(LANES) {
                 let first = v * width + u;
                 let at = lens.rays_from(first).at.map(|x| lanes.load(x));
@@ -130,7 +130,7 @@ impl Body for Casting<'_> {
     }
 }
 
-/// Gives the surfaces that were cast their brightness.
+/// Computes the brightness of the surfaces that were cast.
 struct Shading<'a> {
     renderer: &'a Renderer<'a>,
     shutter: Shutter<'a>,
@@ -201,7 +201,7 @@ struct Seen<'a> {
 }
 
 impl Seen<'_> {
-    /// What a pixel sees, then what its neighbours see (itself again outside the image).
+    /// The surface of a pixel, then those of its neighbours (its own again outside the image).
     #[inline(always)]
     fn around(&self, u: usize, v: usize) -> [f32; 5] {
         let at = v * self.width + u;
@@ -215,7 +215,7 @@ impl Seen<'_> {
         ]
     }
 
-    /// Marks the pixels of a row that see another surface than one of their neighbours.
+    /// Marks the pixels of a row whose surface differs from that of a neighbour.
     #[inline(always)]
     fn mark_edges(&self, v: usize, is_edge: &mut Vec<bool>) {
         let row = |v: usize| &self.surfaces[v * self.width..][..self.width];

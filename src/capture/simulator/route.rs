@@ -1,17 +1,17 @@
-//! Rounds through rooms: a closed route of places and headings, never walked twice exactly alike.
+//! Rounds through rooms: a closed route of positions and headings, never walked exactly alike twice.
 
 use nalgebra::Vector3;
 
 use crate::capture::simulator::random::Stream;
 
-/// A place that a route passes, and where the camera looks there.
+/// A position that a route passes, and the camera's direction there.
 #[derive(Debug, Clone, Copy)]
 pub struct Waypoint {
-    /// On the floor, metres.
+    /// Position on the floor, metres.
     pub at: [f64; 2],
-    /// About the vertical from +x towards +y, degrees; grows without wrapping along the route.
+    /// Heading about the vertical from +x towards +y, degrees; grows without wrapping along the route.
     pub heading_deg: f64,
-    /// Of the optical axis, degrees, negative looks down.
+    /// Elevation of the optical axis, degrees, negative looks down.
     pub elevation_deg: f64,
 }
 
@@ -25,32 +25,32 @@ pub const fn waypoint(x: f64, y: f64, heading_deg: f64, elevation_deg: f64) -> W
 pub struct Route {
     /// About 0.8 m apart: where they are denser the camera is slower.
     pub waypoints: &'static [Waypoint],
-    /// What the heading has grown by after a round, degrees.
+    /// Increase of the heading over a round, degrees.
     pub turn_deg: f64,
     /// Height of the camera, metres.
     pub height_m: f64,
-    /// Rounds that show all there is to see.
+    /// Number of rounds that show everything.
     pub rounds: usize,
 }
 
-/// Where a camera stands and looks.
+/// Position and direction of a camera.
 #[derive(Debug, Clone, Copy)]
 pub struct RoutePose {
-    /// Metres.
+    /// Position, metres.
     pub place: Vector3<f64>,
     /// Heading and elevation, radians.
     pub angles: [f64; 2],
 }
 
 impl Route {
-    /// The pose `phase` waypoints after the first one. Each round has offsets of its own by `seed`.
+    /// Returns the pose `phase` waypoints after the first one. Each round has different offsets, chosen by `seed`.
     pub fn at(&self, phase: f64, seed: u64) -> RoutePose {
         spline(phase, |index| self.control(index, seed))
     }
 
     /// Length of a round without its offsets, metres.
     pub fn length_m(&self) -> f64 {
-        /// Chords for each waypoint: a millimetre's error on a round.
+        /// Chords per waypoint: an error of a millimetre on a round.
         const CHORDS: usize = 16;
         let at =
             |chord: usize| spline(chord as f64 / CHORDS as f64, |index| self.waypoint(index)).place;
@@ -71,13 +71,13 @@ impl Route {
         }
     }
 
-    /// The same as this round passes it.
+    /// The same waypoint with the offsets of its round.
     fn control(&self, index: i64, seed: u64) -> RoutePose {
-        /// How far a round as a whole and each of its waypoints lie beside the table: a hand's breadth and the
-        /// height of a step, so that two rounds see the same from places that differ.
+        /// Largest offset from the table of a round as a whole and of each of its waypoints: a hand's breadth and the
+        /// height of a step, so that two rounds see the same from different positions.
         const ROUND_M: [f64; 3] = [0.06, 0.06, 0.10];
         const PLACE_M: [f64; 3] = [0.10, 0.10, 0.05];
-        /// The same of heading and elevation, degrees.
+        /// Largest offset of heading and elevation, degrees.
         const ANGLE_DEG: [f64; 2] = [6.0, 3.0];
         let round = index.div_euclid(self.waypoints.len() as i64);
         let mut of_round = Stream::new(seed, 0x7080_0000 ^ round as u64);

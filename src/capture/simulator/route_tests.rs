@@ -1,4 +1,4 @@
-//! Tests of the scenes with rooms: where the camera goes, and that rounds see the same.
+//! Tests of the scenes with rooms: the camera's path, and that its rounds see the same.
 
 use nalgebra::Vector3;
 
@@ -9,16 +9,16 @@ use crate::capture::simulator::scene_kind::SceneKind;
 use crate::capture::simulator::summary::summarize;
 use crate::capture::simulator::twins::PERIOD_M;
 
-/// Seeds that the paths are checked for.
+/// Seeds with which the paths are checked.
 const SEEDS: std::ops::Range<u64> = 1..13;
 
-/// Poses of a scene as a whole.
+/// Poses of a walk through a whole scene.
 fn walked(scene: SceneKind, seed: u64) -> Vec<StampedPose> {
     let params = SimulatorParams { seed, ..SimulatorParams::default() }.with_scene(scene);
     Simulator::unpainted(params).unwrap().ground_truth
 }
 
-/// Which room of the flat a place is in.
+/// Index of the room of the flat that contains a position.
 fn room_of(place: &Vector3<f64>) -> Option<usize> {
     ROOMS_M.iter().position(|room| {
         (0..2).all(|k| (0.0..f64::from(ROOM_M[k])).contains(&(place[k] - f64::from(room[k]))))
@@ -47,7 +47,7 @@ fn the_flat_is_walked_through_twice_and_every_room_is_entered_twice() {
 }
 
 #[test]
-fn a_walk_is_smooth_and_keeps_clear_of_everything() {
+fn a_walk_is_smooth_and_keeps_clear_of_all_surfaces() {
     for (scene, seed) in SEEDS.flat_map(|seed| [(SceneKind::Flat, seed), (SceneKind::Twins, seed)])
     {
         let blocks = furnish::furnish(scene, seed).blocks;
@@ -65,7 +65,7 @@ fn a_walk_is_smooth_and_keeps_clear_of_everything() {
             let turn_deg_s = two[0].rotation.angle_to(&two[1].rotation).to_degrees() * 30.0;
             assert!(turn_deg_s < 45.0, "{said}: {turn_deg_s} °/s at {}", two[0].translation);
         }
-        // It never turns without moving: in no second by less than this.
+        // It never turns without moving: it moves farther than this in every second.
         for second in poses.windows(31) {
             let steps =
                 second.windows(2).map(|two| (two[1].translation - two[0].translation).norm());
@@ -81,7 +81,7 @@ fn a_walk_is_smooth_and_keeps_clear_of_everything() {
 }
 
 #[test]
-fn the_second_round_passes_near_the_first_one_and_not_on_it() {
+fn the_second_round_passes_near_the_first_but_not_on_it() {
     for seed in SEEDS {
         let poses = walked(SceneKind::Flat, seed);
         let (first, second) = poses.split_at(poses.len() / 2);
@@ -104,7 +104,7 @@ fn the_second_round_passes_near_the_first_one_and_not_on_it() {
 }
 
 #[test]
-fn a_route_goes_on_for_ever_and_a_longer_sequence_starts_alike() {
+fn a_route_is_endless_and_a_longer_sequence_starts_alike() {
     let whole = walked(SceneKind::Flat, 3);
     let params = SimulatorParams { seed: 3, frames: 20_000, ..Default::default() };
     let longer = Simulator::unpainted(params.with_scene(SceneKind::Flat)).unwrap();
@@ -140,11 +140,11 @@ fn the_twin_rooms_look_exactly_alike() {
     let period = f64::from(PERIOD_M);
     for (x, y, heading_deg) in [(2.0, 2.0, -80.0), (2.4, 1.2, 170.0), (2.9, 3.0, -120.0)] {
         let (one, other) = (image(x, y, heading_deg), image(x + period, y, heading_deg));
-        // Rounding of the places moves an edge by less than a thousandth of a pixel.
+        // Rounding of the positions moves an edge by less than a thousandth of a pixel.
         assert!(difference(&one, &other) < 0.05, "room: {}", difference(&one, &other));
         assert!(difference(&one, &image(x, y, heading_deg + 5.0)) > 3.0);
     }
-    // Across the corridor all three bays.
+    // Across the corridor all three bays look alike.
     for heading_deg in [90.0, 60.0] {
         let bays = [0.0, 1.0, 2.0].map(|bay| image(2.0 + bay * period, 4.8, heading_deg));
         assert!(difference(&bays[0], &bays[1]) < 0.05, "{}", difference(&bays[0], &bays[1]));

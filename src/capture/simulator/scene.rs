@@ -1,4 +1,4 @@
-//! What stands in a scene: textured blocks, lit once and for all, and where a camera may walk.
+//! Contents of a scene: textured blocks with fixed lighting, and the space in which a camera may walk.
 
 use crate::capture::simulator::pattern::{Pattern, TEXTURE_SIZE, paint_all};
 use crate::capture::simulator::random::Stream;
@@ -6,7 +6,7 @@ use crate::capture::simulator::route::Route;
 use crate::capture::simulator::texture::Texture;
 use crate::slam::kernel::{Floats, Instructions};
 
-/// Texels a metre of a surface that is not made to measure: 2 mm a texel.
+/// Texels per metre of a surface at its natural size: 2 mm per texel.
 pub const TEXELS_PER_METRE: f32 = 500.0;
 
 /// How one side of a block is covered.
@@ -14,7 +14,7 @@ pub const TEXELS_PER_METRE: f32 = 500.0;
 pub struct Face {
     /// Index into [`Scene::textures`].
     pub texture: usize,
-    /// Texels a metre along the two axes of the face.
+    /// Texels per metre along the two axes of the face.
     pub texels_per_metre: [f32; 2],
     /// Texel at the centre of the face.
     pub offset: [f32; 2],
@@ -24,7 +24,7 @@ pub struct Face {
     pub middle: f32,
 }
 
-/// A box turned about the vertical, seen from outside, or from inside when hollow.
+/// A box rotated about the vertical, seen from outside, or from inside if hollow.
 #[derive(Debug, Clone)]
 pub struct Block {
     /// Centre in the world, metres.
@@ -42,8 +42,8 @@ pub struct Block {
 }
 
 impl Block {
-    /// Light that falls on points with this normal, as a factor on reflectance. It depends on
-    /// nothing but the place, so a surface has one brightness from wherever it is seen.
+    /// Light on points with this normal, as a factor on reflectance. It depends only on the position, so a surface has
+    /// the same brightness from every viewpoint.
     #[inline(always)]
     pub fn light<I: Instructions>(
         &self,
@@ -51,9 +51,9 @@ impl Block {
         point: [Floats<I>; 3],
         normal: [f32; 3],
     ) -> Floats<I> {
-        /// Share of the light that comes from everywhere.
+        /// Ambient share of the light.
         const AMBIENT: f32 = 0.62;
-        /// Light of the lamp at no distance, facing it.
+        /// Light of the lamp at zero distance, facing it.
         const LAMP: f32 = 0.75;
         /// Distance at which the lamp's light is halved, metres.
         const HALF_DISTANCE_M: f32 = 3.0;
@@ -72,14 +72,14 @@ impl Block {
     }
 }
 
-/// The free space of a scene: the ellipsoid a camera's path stays in, and where it looks.
+/// The free space of a scene: the ellipsoid that contains a camera's path, and the camera's directions.
 #[derive(Debug, Clone, Copy)]
 pub struct Stage {
     /// Centre of the path, metres.
     pub centre: [f64; 3],
     /// Half axes of the path, metres.
     pub reach: [f64; 3],
-    /// Where on its round the path starts: a range of phases, radians.
+    /// Start of the path on its round: a range of phases, radians.
     pub start_rad: (f64, f64),
     /// Mean heading (about the vertical from +x towards +y), radians.
     pub heading_rad: f64,
@@ -89,36 +89,36 @@ pub struct Stage {
     pub elevation_rad: f64,
     /// How far the elevation swings, radians.
     pub elevation_swing_rad: f64,
-    /// Where a handheld camera walks instead of within the ellipsoid.
+    /// Route that a handheld camera walks instead of the ellipsoid.
     pub route: Option<&'static Route>,
 }
 
 /// Blocks, their textures and their light. The world is z up, in metres.
 #[derive(Debug, Clone)]
 pub struct Scene {
-    /// Everything that can be seen.
+    /// Everything visible.
     pub blocks: Vec<Block>,
-    /// What the faces refer to.
+    /// Textures that the faces refer to.
     pub textures: Vec<Texture>,
 }
 
 impl Scene {
-    /// A scene of blocks with freshly painted textures.
+    /// Builds a scene of blocks and paints its textures.
     pub fn new(blocks: Vec<Block>, seed: u64) -> Self {
         Self { blocks, textures: paint_all(seed) }
     }
 }
 
-/// Puts blocks into a scene, each with its own cut of the textures.
+/// Places blocks in a scene, each with a different cut of the textures.
 #[derive(Debug)]
 pub struct Builder {
     /// Everything placed so far.
     pub blocks: Vec<Block>,
     /// Random choices of the scene.
     pub stream: Stream,
-    /// Where the origin of the places that are given lies in the world, metres.
+    /// Origin of the positions passed in, in the world, metres.
     pub origin: [f32; 2],
-    /// The lamp of what is placed, metres in the world.
+    /// The lamp of the blocks placed, metres in the world.
     pub lamp: [f32; 3],
 }
 
@@ -127,7 +127,7 @@ pub struct Builder {
 pub struct Cover {
     /// Pattern of all sides.
     pub pattern: Pattern,
-    /// Texels a metre; fewer make the pattern larger.
+    /// Texels per metre; fewer make the pattern larger.
     pub density: f32,
     /// Factor on the pattern's contrast.
     pub contrast: f32,
@@ -210,7 +210,7 @@ impl Builder {
         }
     }
 
-    /// A chair whose back stands on the side away from its heading.
+    /// A chair whose back is on the side away from its heading.
     pub fn chair(&mut self, at: [f32; 2], turn_rad: f32, cover: Cover) {
         self.table(at, [0.42, 0.42, 0.45], turn_rad, cover);
         let (sin, cos) = turn_rad.sin_cos();
@@ -292,7 +292,7 @@ impl Builder {
 /// A scene without its textures.
 #[derive(Debug, Clone)]
 pub struct Furnished {
-    /// Everything that can be seen.
+    /// Everything visible.
     pub blocks: Vec<Block>,
     /// Where a camera may walk.
     pub stage: Stage,

@@ -1,4 +1,4 @@
-//! Which scenes there are, by name.
+//! The scenes, by name.
 
 use std::str::FromStr;
 
@@ -6,7 +6,7 @@ use serde::de::IntoDeserializer;
 use serde::de::value::Error;
 use serde::{Deserialize, Serialize};
 
-/// Which scene is seen.
+/// The scene that is simulated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum SceneKind {
@@ -16,9 +16,9 @@ pub enum SceneKind {
     Plane,
     /// A corridor of 24 × 2.4 × 2.6 m.
     Corridor,
-    /// Four furnished rooms about a corridor, 9 × 10 × 2.7 m, walked through in rounds.
+    /// Four furnished rooms around a corridor, 9 × 10 × 2.7 m, walked through in rounds.
     Flat,
-    /// Two rooms that are exactly alike on a corridor that repeats, 13.8 × 5.8 × 2.7 m.
+    /// Two identical rooms on a repeating corridor, 13.8 × 5.8 × 2.7 m.
     Twins,
 }
 

@@ -32,12 +32,12 @@ impl Sensor {
     pub fn exposure(&self, time_s: f64) -> (f64, f64) {
         let phase = std::f64::consts::TAU * time_s / self.params.exposure_period_s;
         let gain = (self.params.gain_amplitude * phase.sin()).exp();
-        // Another phase, so that gain and offset are not one and the same change.
+        // A different rate, so that gain and offset do not change in step.
         (gain, self.params.offset_amplitude * (1.618 * phase).sin())
     }
 
-    /// Quantises the light of frame `sequence` taken at `time_s`, with noise that depends on seed,
-    /// frame and pixel only.
+    /// Quantises the light of frame `sequence` taken at `time_s`, with noise that depends only on seed, frame and
+    /// pixel.
     pub fn read_out(&self, sequence: u64, time_s: f64, light: &mut [f32], pixels: &mut [u8]) {
         let (gain, offset) = self.exposure(time_s);
         let (gain, offset) = (gain as f32, offset as f32);

@@ -1,4 +1,4 @@
-//! How bright a face is where rays meet it, many at a time.
+//! Brightness of a face where rays meet it, many at a time.
 
 use crate::capture::simulator::lens::Ray;
 use crate::capture::simulator::scene::{Block, Face, Scene};
@@ -6,10 +6,10 @@ use crate::capture::simulator::texture::{Footprint, Texture};
 use crate::capture::simulator::view::{LocalView, NO_SURFACE};
 use crate::slam::kernel::{Floats, Instructions};
 
-/// Side of the square that a pixel averages over, pixels: its own area and the blur of a good lens,
-/// which keeps what is finer than the pixels out of the image.
+/// Side of the square that a pixel averages over, pixels: its own area and the blur of a good lens, which keeps detail
+/// finer than the pixels out of the image.
 pub const PIXEL_WIDTH: f32 = 1.4;
-/// Brightness where no surface is.
+/// Brightness where there is no surface.
 const SKY_GREY: f32 = 128.0;
 
 /// A face as one camera sees it: everything that does not change from ray to ray.
@@ -29,7 +29,7 @@ pub struct FaceView<'a> {
 }
 
 impl<'a> FaceView<'a> {
-    /// A surface by its number; `None` where there is none.
+    /// Returns the view of a surface by its number; `None` for no surface.
     #[inline(always)]
     pub fn new(scene: &'a Scene, views: &'a [LocalView], surface: f32) -> Option<Self> {
         if surface == NO_SURFACE {
@@ -86,7 +86,7 @@ impl<'a> FaceView<'a> {
         number(255.0) * reflectance * self.light(lanes, point)
     }
 
-    /// How far what rays of direction `d` meet at `depth` moves along the face when their directions change, metres.
+    /// How far the points that rays of direction `d` meet at `depth` move along the face when `d` changes, metres.
     #[inline(always)]
     fn step<I: Instructions>(
         &self,
@@ -127,7 +127,7 @@ impl<'a> FaceView<'a> {
     }
 }
 
-/// Brightness of a surface or of where none is.
+/// Brightness of a surface, or of the sky for `None`.
 #[inline(always)]
 pub fn grey<I: Instructions>(
     lanes: I,

@@ -1,10 +1,10 @@
-//! Figures of a sequence: how far and fast the camera goes and how much it sees.
+//! Figures of a sequence: length and speed of the camera's path, and how much texture it sees.
 
 use serde::Serialize;
 
 use crate::slam::trajectory::StampedPose;
 
-/// What a path amounts to.
+/// Summary of a path.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct PathSummary {
     /// Length of the path through all frames, metres.
@@ -13,13 +13,13 @@ pub struct PathSummary {
     pub extent_m: f64,
     /// Sum of the angles between consecutive frames, degrees.
     pub rotation_deg: f64,
-    /// Path length over duration, metres a second.
+    /// Path length over duration, metres per second.
     pub mean_speed_m_s: f64,
-    /// First to last stamp, seconds.
+    /// Time from first to last stamp, seconds.
     pub duration_s: f64,
 }
 
-/// Adds up a trajectory.
+/// Summarises a trajectory.
 pub fn summarize(poses: &[StampedPose]) -> PathSummary {
     let mut summary = PathSummary::default();
     let (Some(first), Some(last)) = (poses.first(), poses.last()) else { return summary };
@@ -40,8 +40,8 @@ pub fn summarize(poses: &[StampedPose]) -> PathSummary {
     summary
 }
 
-/// Share of the inner pixels whose gradient (central difference, grey levels a pixel) is at least
-/// `threshold`; 0 for images without inner pixels.
+/// Share of the inner pixels whose gradient (central difference, grey levels per pixel) is at least `threshold`; 0 for
+/// images without inner pixels.
 pub fn gradient_share(pixels: &[u8], width: usize, threshold: f64) -> f64 {
     let height = pixels.len().checked_div(width).unwrap_or(0);
     if width < 3 || height < 3 {

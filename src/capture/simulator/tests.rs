@@ -43,7 +43,7 @@ pub fn distance(block: &Block, point: &Vector3<f64>) -> f64 {
 }
 
 #[test]
-fn every_seed_walks_as_the_default_rig_promises() {
+fn every_seed_gives_a_path_as_the_default_rig_promises() {
     for seed in 0..40 {
         let room = furnish::furnish(SceneKind::Room, seed);
         let params = SimulatorParams { seed, ..Default::default() };
@@ -76,7 +76,7 @@ fn every_seed_walks_as_the_default_rig_promises() {
 }
 
 #[test]
-fn the_default_rig_sees_what_it_promises() {
+fn the_default_rig_sees_the_promised_texture_and_depth() {
     let params = SimulatorParams::default();
     assert_eq!((params.width, params.height, params.frames), (640, 480, 600));
     assert_eq!((params.focal_px, params.rate_hz, params.sensor.noise_std_dev), (525.0, 30.0, 2.0));
@@ -105,7 +105,7 @@ fn the_default_rig_sees_what_it_promises() {
     assert!((0.20..=0.40).contains(&clean_share), "{clean_share}");
 }
 
-/// Bilinear value of an image at a place; `None` at the border.
+/// Bilinear value of an image at a position; `None` at the border.
 fn interpolate(image: &[u8], width: usize, at: &Vector2<f64>) -> Option<f64> {
     let height = image.len() / width;
     let inside = |x: f64, size: usize| x >= 1.0 && x < (size - 2) as f64;
@@ -119,8 +119,8 @@ fn interpolate(image: &[u8], width: usize, at: &Vector2<f64>) -> Option<f64> {
     Some(row(0) * (1.0 - b) + row(1) * b)
 }
 
-/// Mean absolute difference between frame `to` and frame `from` warped by exact depth and poses,
-/// over pixels whose neighbourhood is smooth in depth and unoccluded; and how many those are.
+/// Mean absolute difference between frame `to` and frame `from` warped by exact depth and poses, over pixels whose
+/// neighbourhood is smooth in depth and unoccluded; and the number of these pixels.
 fn warp_difference(
     source: &mut Simulator,
     frames: &[Vec<u8>],
@@ -176,8 +176,8 @@ fn rectified_frames(source: &mut Simulator, wanted: &[usize]) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn exact_depth_and_poses_carry_one_frame_into_another() {
-    // Of the twins' wallpaper, seen from 0.9 m, more lies between two pixels.
+fn exact_depth_and_poses_warp_one_frame_onto_another() {
+    // The twins' wallpaper, seen from 0.9 m, has more detail between two pixels.
     for (scene, detail) in [
         (SceneKind::Room, 1.0),
         (SceneKind::Plane, 1.0),
@@ -276,7 +276,7 @@ fn a_frame_and_its_depth_are_the_same_alone_and_together() {
     let (mut rolling, mut blurred) = (sharp.clone(), sharp.clone());
     rolling.sensor.row_time_us = 50.0;
     blurred.sensor.exposure_ms = 10.0;
-    // Of no whole number of lanes, and used again from one to the next.
+    // A width that is not a multiple of the lanes; the scratch memory is reused from one to the next.
     let odd = SimulatorParams { width: 101, height: 35, ..sharp.clone() };
     let mut scratch = RenderScratch::default();
     for params in [sharp, rolling, odd, blurred] {
@@ -301,7 +301,7 @@ fn a_scaled_world_looks_the_same() {
 }
 
 #[test]
-fn the_depth_of_the_plane_is_that_of_geometry() {
+fn the_depth_of_the_plane_matches_geometry() {
     let source = Simulator::new(small(SceneKind::Plane)).unwrap();
     let k = source.params().intrinsics();
     let depth = source.raw_depth(7).unwrap();
@@ -344,7 +344,7 @@ fn a_rolling_shutter_takes_every_row_at_its_own_time() {
 }
 
 #[test]
-fn motion_blur_softens_what_moves_and_nothing_else() {
+fn motion_blur_softens_only_what_moves() {
     let mut params = noiseless(small(SceneKind::Room));
     params.motion.mean_turn_deg_s = 60.0;
     let share = |params: &SimulatorParams| {
@@ -362,7 +362,7 @@ fn motion_blur_softens_what_moves_and_nothing_else() {
 }
 
 #[test]
-fn simple_motions_are_what_they_say() {
+fn simple_motions_match_their_names() {
     let poses = |kind: MotionKind| {
         let mut params = SimulatorParams { frames: 300, ..small(SceneKind::Plane) };
         params.motion.kind = kind;

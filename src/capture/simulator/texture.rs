@@ -4,10 +4,10 @@ use crate::capture::simulator::lens::LANES;
 use crate::slam::kernel::lanes_kernel::Pixel;
 use crate::slam::kernel::{Floats, Instructions};
 
-/// Reflectance of a tileable square surface, 0 (black) to 1 (white), with every halving of it.
+/// Reflectance of a tileable square surface, 0 (black) to 1 (white), with all its mip levels.
 ///
-/// One sheet holds all levels: the finest on the left, the others on its right below each other, level l from row
-/// `size − 2 (size >> l)` on. Every row ends with its first texel, so that what lies right of a texel is next to it.
+/// One sheet holds all levels: the finest on the left, the others on its right below each other, level l from row `size
+/// − 2 (size >> l)` on. Every row ends with its first texel, so that every texel has a neighbour on its right.
 #[derive(Debug, Clone)]
 pub struct Texture {
     /// In [`STEPS`], row by row.
@@ -15,7 +15,7 @@ pub struct Texture {
     size: usize,
 }
 
-/// Where pixels fall on a texture, in texels of the finest level.
+/// Footprints of pixels on a texture, in texels of the finest level.
 #[derive(Debug, Clone, Copy)]
 pub struct Footprint<F> {
     /// Centre of the pixel.
@@ -52,7 +52,7 @@ impl Texture {
         texture
     }
 
-    /// Entries from one row of the sheet to the next: the rows of the two finest levels.
+    /// Entries from one row of the sheet to the next: a row of each of the two finest levels.
     fn stride(size: usize) -> usize {
         size + 1 + size / 2 + 1
     }
@@ -69,8 +69,8 @@ impl Texture {
     }
 
     /// Means over the footprints of pixels, of which only the first `wanted` matter: trilinear samples as wide as the
-    /// short axis, in a row along the long axis (Heckbert 1989, with Gaussian weights left out), so that a surface
-    /// keeps its brightness from every distance and angle.
+    /// short axis, in a row along the long axis (Heckbert 1989, without Gaussian weights), so that a surface keeps its
+    /// brightness at every distance and angle.
     #[inline(always)]
     pub fn sample<I: Instructions>(
         &self,
@@ -80,7 +80,7 @@ impl Texture {
     ) -> Floats<I> {
         let number = |x: f32| lanes.splat(x);
         let ([ux, uy], [vx, vy]) = (footprint.du, footprint.dv);
-        // Principal axes of the ellipse that the unit circle of pixels becomes.
+        // Principal axes of the ellipse onto which the unit circle of pixels is mapped.
         let (xx, xy, yy) = (ux * ux + vx * vx, ux * uy + vx * vy, uy * uy + vy * vy);
         let mean = number(0.5) * (xx + yy);
         let spread = (number(0.25) * (xx - yy) * (xx - yy) + xy * xy).sqrt();
@@ -122,8 +122,8 @@ impl Texture {
         centre: [Floats<I>; 2],
         width: Floats<I>,
     ) -> Floats<I> {
-        // The power of two below the width is the level, the rest the way to the next: log2 made of
-        // straight pieces, exact at whole levels and without a call.
+        // The power of two below the width is the level, the rest the fraction to the next: a piecewise linear log2,
+        // exact at whole levels and without a call.
         let size = lanes.splat(self.size as f32);
         let width = width.max(lanes.splat(1.0)).min(size);
         let whole = width.power_of_two_below();
@@ -135,7 +135,8 @@ impl Texture {
         lanes.splat(1e-3).greater(between).select(first, first + between * (second - first))
     }
 
-    /// On the levels whose texels are `width` of the finest, which is 1 / `scale`. Meaningless for a level that does not exist.
+    /// Samples the levels whose texels are `width` = 1 / `scale` of the finest. Meaningless for a level that does not
+    /// exist.
     #[inline(always)]
     fn bilinear<I: Instructions>(
         &self,
@@ -156,7 +157,7 @@ impl Texture {
         let (left, top) = (wrapped(column), wrapped(row));
         let below = top + number(1.0);
         let bottom = side.greater(below).select(below, number(0.0));
-        // Whole numbers below 2²⁴, as all places of a sheet.
+        // Whole numbers below 2²⁴, like all positions on a sheet.
         let coarse = (size - side - side) * stride + (size + number(1.0));
         let corner = size.greater(side).select(coarse, number(0.0)) + left;
         let [p00, p10] = u16::pairs(&self.sheet, (corner + top * stride).truncate());

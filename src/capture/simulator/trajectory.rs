@@ -8,8 +8,8 @@ use crate::capture::simulator::route::{Route, RoutePose};
 use crate::capture::simulator::scene::Stage;
 use crate::slam::geometry::se3::SE3;
 
-/// Time over which mean speed and mean rate of turning hold, seconds. It is fixed, so that a
-/// shorter sequence is the beginning of a longer one.
+/// Time over which mean speed and mean rate of turning hold, seconds. Fixed, so that a shorter sequence is the
+/// beginning of a longer one.
 const MEAN_OVER_S: f64 = 20.0;
 /// Step of the sums that measure path and turning, seconds.
 const MEASURE_STEP_S: f64 = 1.0 / 30.0;
@@ -36,7 +36,7 @@ fn sum(waves: &[Wave], phase: f64) -> f64 {
 #[derive(Debug, Clone)]
 pub struct Trajectory {
     stage: Stage,
-    /// What is walked along instead, and the seed of its rounds.
+    /// The route that is walked instead, and the seed of its rounds.
     route: Option<(&'static Route, u64)>,
     /// Offsets from the stage's centre along x, y, z; functions of the walking phase.
     walk: [Vec<Wave>; 3],
@@ -44,15 +44,15 @@ pub struct Trajectory {
     turn: [Vec<Wave>; 3],
     /// Tremor of x, y, z (metres) and heading, elevation, roll (radians); functions of time.
     tremor: [Vec<Wave>; 6],
-    /// Walking phase a second; on a route, waypoints a second.
+    /// Walking phase per second; on a route, waypoints per second.
     walk_rate: f64,
-    /// Turning phase a second.
+    /// Turning phase per second.
     turn_rate: f64,
 }
 
 impl Trajectory {
-    /// A path through the stage, paced so that mean speed and turning are as asked. A route has turns of its own,
-    /// and the mean speed holds over a round.
+    /// Builds a path through the stage, paced for the requested mean speed and turning. A route has its own turns, and
+    /// the mean speed holds over a round.
     pub fn new(stage: Stage, motion: &MotionParams, seed: u64) -> Self {
         let mut stream = Stream::new(seed, 0x7247);
         let route = stage.route.filter(|_| motion.kind == MotionKind::Handheld);
@@ -119,15 +119,15 @@ impl Trajectory {
     }
 }
 
-/// The phase rate at which `measure` gives `target`; 0 where nothing moves or tremor alone exceeds it.
+/// Finds the phase rate at which `measure` returns `target`; 0 if nothing moves or tremor alone exceeds it.
 fn pace(target: f64, measure: impl Fn(f64) -> f64) -> f64 {
     /// Fastest phase, rad/s; a stage is at least 0.2 m wide, so this is beyond any allowed speed.
     const FASTEST: f64 = 64.0;
     if target == 0.0 || measure(1.0) <= 0.0 || measure(0.0) >= target {
         return 0.0;
     }
-    // The first rate of a doubling row that is too fast, then bisection below it: the measure
-    // grows with the rate wherever a period is sampled often enough.
+    // The first rate of a doubling series that is too fast, then bisection below it: the measure grows with the rate
+    // wherever a period is sampled often enough.
     let mut high = 1.0 / 64.0;
     while measure(high) < target && high < FASTEST {
         high *= 2.0;
@@ -193,7 +193,7 @@ fn turn_waves(stage: &Stage, kind: MotionKind, stream: &mut Stream) -> [Vec<Wave
     if !matches!(kind, MotionKind::Handheld | MotionKind::Rotation) {
         return [vec![], vec![], vec![]];
     }
-    /// How far a hand lets the camera lean, radians.
+    /// Amplitude of the roll of a handheld camera, radians.
     const ROLL_RAD: f64 = 0.05;
     let mut phase = || stream.uniform_f64(0.0, std::f64::consts::TAU);
     let (heading, elevation) = (stage.heading_swing_rad, stage.elevation_swing_rad);

@@ -1,15 +1,15 @@
-//! Two rooms that are exactly alike on a corridor that repeats: what no loop may be closed between.
+//! Two identical rooms on a repeating corridor, between which no loop may be closed.
 //!
-//! Everything stands a second time one bay further east, the corridor a third time: textures, doors, light.
+//! Everything is repeated one bay further east, the corridor once more: textures, doors, light.
 
 use crate::capture::simulator::flat::{Door, ROOM_M, Side, enclose, living, stage};
 use crate::capture::simulator::pattern::Pattern;
 use crate::capture::simulator::route::{Route, Waypoint, waypoint};
 use crate::capture::simulator::scene::{Builder, Cover, Furnished, picture};
 
-/// After how many metres along x everything repeats.
+/// Period of the repetition along x, metres.
 pub const PERIOD_M: f32 = 4.6;
-/// Bays of the corridor.
+/// Number of bays of the corridor.
 const BAYS: usize = 3;
 /// Width of the corridor, metres.
 const CORRIDOR_M: f32 = 1.6;
@@ -68,7 +68,7 @@ const REST: [Waypoint; 23] = [
 /// Into the first room and out, into the second and out, to the end of the corridor and back.
 static ROUND: [Waypoint; 63] = twins_round();
 
-/// The round; the second room's part is the first one's, a period on.
+/// The round; the second room's part is the first one's, shifted by a period.
 const fn twins_round() -> [Waypoint; 63] {
     let mut round = [BAY[0]; 63];
     let mut i = 0;
@@ -88,7 +88,7 @@ const fn twins_round() -> [Waypoint; 63] {
 
 static ROUTE: Route = Route { waypoints: &ROUND, turn_deg: 360.0, height_m: 1.4, rounds: 1 };
 
-/// Puts them up; the seed chooses textures and small things, the same in both rooms.
+/// Builds the rooms and the corridor; the seed chooses textures and small objects, the same in both rooms.
 pub fn twins(seed: u64) -> Furnished {
     let mut b = Builder::new(seed, [0.0; 3]);
     let plaster = Cover::of(Pattern::Plaster);
@@ -101,14 +101,14 @@ pub fn twins(seed: u64) -> Furnished {
     living(&mut b);
     repeat(&mut b, 0, 1);
     let corridor = b.blocks.len();
-    // A bay of the corridor has no ends: those are put up behind.
+    // A bay of the corridor has no ends: those are added afterwards.
     bay(&mut b, door);
     repeat(&mut b, corridor, BAYS - 1);
     close(&mut b, door);
     Furnished { blocks: b.blocks, stage: stage(&ROUTE) }
 }
 
-/// Puts up everything from the block `first` on again, `times`, each a period further east.
+/// Repeats everything from the block `first` on, `times` times, each a period further east.
 fn repeat(b: &mut Builder, first: usize, times: usize) {
     let originals = b.blocks[first..].to_vec();
     for time in 1..=times {
@@ -132,7 +132,7 @@ fn bay(b: &mut Builder, door: (f32, f32)) {
     let covers = [paper, paper, paper, brick, carpet, Cover::of(Pattern::Plaster)];
     let first = b.blocks.len();
     enclose(b, origin, [PERIOD_M, CORRIDOR_M], covers, &[door]);
-    // Without the walls across, and floor and ceiling without what lies under those.
+    // Without the end walls, and without the parts of floor and ceiling below and above them.
     let centre = b.origin[0] + 0.5 * PERIOD_M;
     let mut blocks = b.blocks.split_off(first);
     let is_across = |half: [f32; 3]| half[0] < half[1] && half[1] > 0.5 * CORRIDOR_M;

@@ -1,4 +1,4 @@
-//! The blocks of a scene as one camera sees them: where rays meet them, many at a time.
+//! The blocks of a scene as one camera sees them: where rays meet them, many rays at a time.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -88,22 +88,22 @@ impl LocalView {
     }
 }
 
-/// What rays meet first.
+/// The nearest surfaces that rays meet.
 #[derive(Debug, Clone, Copy)]
 pub struct Nearest<R> {
-    /// Depth along the optical axis, metres; infinite where nothing is.
+    /// Depth along the optical axis, metres; infinite where there is no surface.
     pub depth: Lanes<R>,
     block: Lanes<R>,
 }
 
 impl<R: Register> Nearest<R> {
-    /// Nothing.
+    /// No surface.
     #[inline(always)]
     pub fn nothing<I: Instructions<Register = R>>(lanes: I) -> Self {
         Self { depth: lanes.splat(f32::INFINITY), block: lanes.splat(NO_SURFACE) }
     }
 
-    /// This or, where it is nearer, one more block.
+    /// Returns this or, where it is nearer, one more block.
     #[inline(always)]
     pub fn or_block<I: Instructions<Register = R>>(
         self,

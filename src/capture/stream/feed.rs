@@ -1,4 +1,4 @@
-//! Where the sender of a stream comes from: a socket that any program may connect to, or a program that is started.
+//! Origin of a stream's sender: a socket that any program may connect to, or a program that is started.
 
 use std::io::ErrorKind;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -13,28 +13,28 @@ use crate::capture::source::Absence;
 use crate::capture::stream::INSTALL_BRIDGE;
 use crate::capture::v4l::device::poll;
 
-/// Pause before a sender is started, or a socket opened, again; doubled each time.
+/// Pause before starting a sender, or opening a socket, again; doubled each time.
 const FIRST_PAUSE_NANOS: i64 = 200_000_000;
 /// The longest such pause.
 const LONGEST_PAUSE_NANOS: i64 = 5_000_000_000;
-/// A program that has lived so long did not fail of its start.
+/// A program that ran this long did not fail at its start.
 const HEALTHY_NANOS: i64 = 10_000_000_000;
 /// How long a program may take to end once its stream is closed: it says goodbye to its peers.
 const GOODBYE_MILLIS: u32 = 1000;
 /// Exit code of a program that does not understand its command line: starting it again does not help.
 const WRONG_USAGE: i32 = 2;
 
-/// Where the sender comes from.
+/// Origin of the sender.
 #[derive(Debug)]
 pub enum Feed {
     /// It connects to a socket.
     Socket(Listener),
-    /// It is started.
+    /// It is a program that is started.
     Program(Program),
 }
 
 impl Feed {
-    /// The stream of a sender that has come, once. `now` is CLOCK_MONOTONIC, nanoseconds.
+    /// Returns the stream of a newly connected sender, once. `now` is CLOCK_MONOTONIC, nanoseconds.
     pub fn connect(&mut self, now: i64) -> Result<Option<UnixStream>, Absence> {
         let stream = match self {
             Self::Socket(listener) => listener.connect(now)?,
@@ -47,7 +47,7 @@ impl Feed {
         Ok(stream)
     }
 
-    /// What can be read when a sender comes.
+    /// Descriptor that becomes readable when a sender connects.
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
         match self {
             Self::Socket(listener) => listener.listener.as_ref().map(AsFd::as_fd),
@@ -55,7 +55,7 @@ impl Feed {
         }
     }
 
-    /// When to try again, CLOCK_MONOTONIC, where nothing else tells.
+    /// When to try again, CLOCK_MONOTONIC, if no descriptor signals it.
     pub fn retry_nanos(&self) -> Option<i64> {
         match self {
             Self::Socket(Listener { listener: Some(_), .. }) => None,
@@ -64,7 +64,7 @@ impl Feed {
         }
     }
 
-    /// Why nobody sends.
+    /// Why there is no sender.
     pub fn absence(&self) -> String {
         match self {
             Self::Socket(listener) => format!(
@@ -75,7 +75,7 @@ impl Feed {
         }
     }
 
-    /// The stream has ended.
+    /// Records that the stream has ended.
     pub fn disconnected(&mut self, now: i64) {
         if let Self::Program(program) = self {
             program.ended(now);
@@ -83,7 +83,7 @@ impl Feed {
     }
 }
 
-/// Pauses that grow from failure to failure.
+/// Pauses that grow with every failure.
 #[derive(Debug, Default)]
 struct Pause {
     next_nanos: i64,
@@ -107,7 +107,7 @@ pub struct Listener {
 }
 
 impl Listener {
-    /// Will listen at `path`.
+    /// Creates a listener that will listen at `path`.
     pub fn new(path: PathBuf) -> Self {
         Self { path, listener: None, pause: Pause::default(), last: String::new() }
     }
@@ -138,13 +138,13 @@ impl Listener {
 impl Drop for Listener {
     fn drop(&mut self) {
         if self.listener.is_some() {
-            // Whoever starts next finds a socket without a listener otherwise, which it removes too.
+            // Otherwise the next process finds a socket without a listener, which it removes as well.
             let _ = std::fs::remove_file(&self.path);
         }
     }
 }
 
-/// Listens at `path`, for processes of this user. A socket that somebody has left there is removed.
+/// Listens at `path`, for processes of this user. A stale socket there is removed.
 fn bind(path: &Path) -> Result<UnixListener, Absence> {
     let at = |reason: String| format!("{}: {reason}", path.display());
     let is_socket =
@@ -165,7 +165,7 @@ fn bind(path: &Path) -> Result<UnixListener, Absence> {
     };
     let open = || {
         let listener = listener?;
-        // Whoever may write to the socket may send: nobody but this user, before the first is accepted.
+        // Any process that may write to the socket may send: restricted to this user's before the first is accepted.
         std::fs::set_permissions(path, PermissionsExt::from_mode(0o600))?;
         listener.set_nonblocking(true)?;
         Ok(listener)
@@ -185,12 +185,12 @@ pub struct Program {
     started_nanos: i64,
     pause: Pause,
     last: String,
-    /// It does not understand what it is told: there is no use in starting it again.
+    /// It does not understand its command line: starting it again is useless.
     is_misused: bool,
 }
 
 impl Program {
-    /// Will start `program` with `arguments`.
+    /// Creates a feed that will start `program` with `arguments`.
     pub fn new(program: PathBuf, arguments: Vec<String>) -> Self {
         let last = format!("{} has not been started yet", program.display());
         let pause = Pause::default();
@@ -233,7 +233,7 @@ impl Program {
         Ok(ours)
     }
 
-    /// Its stream is closed: it ends, or is ended.
+    /// Waits for the end of the program after its stream was closed, and kills it if necessary.
     fn ended(&mut self, now: i64) {
         let Some(mut child) = self.child.take() else { return };
         let program = self.program.display();
@@ -253,27 +253,27 @@ impl Program {
     }
 }
 
-/// Waits for the end of a program that knows that it should end.
+/// Waits for a program that has been told to end; kills it and returns `None` if it does not.
 fn wait_or_kill(child: &mut Child) -> Option<std::process::ExitStatus> {
     const STEP_MILLIS: u32 = 5;
     for _ in 0..GOODBYE_MILLIS / STEP_MILLIS {
         if let Ok(Some(status)) = child.try_wait() {
             return Some(status);
         }
-        // Without a descriptor it is a sleep.
+        // Without a descriptor this is a sleep.
         let _ = poll(&mut [], STEP_MILLIS);
     }
-    // What cannot be killed is gone already.
+    // A program that cannot be killed has already ended.
     let _ = child.kill();
     let _ = child.wait();
     None
 }
 
-/// Waits until one of `descriptors` can be read, at most `millis`.
+/// Waits up to `millis` until one of `descriptors` can be read.
 pub fn await_readable<'a>(descriptors: impl Iterator<Item = BorrowedFd<'a>>, millis: u32) {
     let mut polled: Vec<PollFd<'_>> =
         descriptors.map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN)).collect();
-    // A signal ends the wait early; the caller looks at everything anyway.
+    // A signal ends the wait early; the caller checks everything anyway.
     let _ = poll(&mut polled, millis);
 }
 

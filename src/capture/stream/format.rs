@@ -1,17 +1,17 @@
-//! A stream of frames as its bytes are: for each frame a header of 64 bytes, then the picture. All numbers are little
-//! endian; docs/sources.md has the table.
+//! Byte layout of a stream of frames: for each frame a header of 64 bytes, then the picture. All numbers are
+//! little-endian; docs/sources.md has the table.
 
 use crate::capture::decode_error::MAX_SIDE;
 use crate::capture::v4l::pixel_format::PixelFormat;
 use crate::capture::v4l::video_device::FourCc;
 
-/// What every header begins with; the digit is the version.
+/// First bytes of every header; the digit is the version.
 pub const MAGIC: [u8; 8] = *b"SDFRAME1";
 /// Bytes of a header.
 pub const HEADER_BYTES: usize = 64;
-/// Longest believable exposure, nanoseconds.
+/// Longest plausible exposure, nanoseconds.
 const MAX_EXPOSURE_NANOS: u64 = 60_000_000_000;
-/// A JPEG is no larger than its pixels in colour, and a header.
+/// A JPEG is no larger than its pixels in colour plus a header.
 const JPEG_BYTES_PER_PIXEL: u64 = 3;
 const JPEG_HEADER_BYTES: u64 = 65_536;
 
@@ -21,9 +21,9 @@ const JPEG_HEADER_BYTES: u64 = 65_536;
 pub enum StreamClock {
     /// CLOCK_MONOTONIC of this machine.
     Monotonic = 0,
-    /// CLOCK_REALTIME, of this machine or of one that is kept equal.
+    /// CLOCK_REALTIME, of this machine or of one that is synchronised with it.
     Realtime = 1,
-    /// Any other: a recording's, a simulation's. Latency counts from the arrival.
+    /// Any other: a recording's, a simulation's. Latency counts from arrival.
     Other = 2,
 }
 
@@ -34,7 +34,7 @@ pub struct StreamHeader {
     pub width: u32,
     /// Height in pixels.
     pub height: u32,
-    /// Bytes from row to row; 0 of a JPEG.
+    /// Bytes from row to row; 0 for a JPEG.
     pub stride: u32,
     /// The picture's format.
     pub format: PixelFormat,
@@ -46,7 +46,7 @@ pub struct StreamHeader {
     pub stamp_nanos: i64,
     /// Exposure time, nanoseconds, 0 where unknown.
     pub exposure_nanos: u64,
-    /// The sender's number of the frame: a gap is a frame that it lost.
+    /// The sender's number of the frame: a gap means frames that it lost.
     pub sequence: u64,
     /// Sensor gain, 0 where unknown.
     pub gain: f32,
@@ -55,25 +55,25 @@ pub struct StreamHeader {
 /// Why bytes are not the header of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum HeaderError {
-    /// Something else than a stream of frames.
+    /// Anything but a stream of frames.
     #[error("these are not frames: a header does not begin with SDFRAME1")]
     Magic,
-    /// A size that no picture has.
+    /// An invalid size.
     #[error("a picture of {0}x{1} pixels; a side has 1 to 8192")]
     Size(u32, u32),
-    /// A format that is not known.
+    /// An unknown format.
     #[error("a picture of the format `{0}`, which is not known")]
     Format(FourCc),
     /// Rows too short for their pixels, or a JPEG that has rows.
     #[error("rows of {0} bytes, which do not fit the format and the width")]
     Stride(u32),
-    /// More or fewer bytes than the picture has.
+    /// More or fewer bytes than the picture needs.
     #[error("a picture of {0} bytes, which do not fit its format and size")]
     Bytes(u32),
-    /// A clock that is not known.
+    /// An unknown clock.
     #[error("a stamp of clock {0}; 0 is CLOCK_MONOTONIC, 1 CLOCK_REALTIME, 2 any other")]
     Clock(u32),
-    /// A value that no camera has, or one that is kept for later and is not zero.
+    /// An invalid value, or a reserved field that is not zero.
     #[error("an exposure, gain, stamp or reserved field out of its range")]
     Value,
 }
@@ -198,7 +198,7 @@ mod tests {
     };
 
     #[test]
-    fn a_header_comes_back_as_it_went() {
+    fn a_header_survives_the_round_trip() {
         let gray = StreamHeader::gray((32, 24), StreamClock::Other, 5, 6);
         for header in [GOOD, gray] {
             assert_eq!(StreamHeader::from_bytes(&header.to_bytes()), Ok(header));
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_picture_has_is_refused() {
+    fn invalid_headers_are_refused() {
         let refused = |change: &dyn Fn(&mut StreamHeader)| {
             let mut header = GOOD;
             change(&mut header);

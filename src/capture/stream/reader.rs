@@ -1,30 +1,30 @@
-//! Frames out of a stream of bytes that may stop anywhere.
+//! Reads frames from a stream of bytes that may stop anywhere.
 
 use std::io::{ErrorKind, Read};
 
 use super::format::{HEADER_BYTES, HeaderError, StreamHeader};
 
-/// Most bytes that are read at a time.
+/// Maximum number of bytes read at a time.
 const CHUNK_BYTES: usize = 1 << 20;
 
-/// What a look at the stream came to.
+/// Outcome of reading the stream.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Progress {
-    /// A frame is whole.
+    /// A frame is complete.
     Frame(StreamHeader),
     /// Nothing more for now.
     Nothing,
-    /// The sender has closed it.
+    /// The sender has closed the stream.
     Closed,
 }
 
-/// Why the stream cannot be read further: after such a fault nobody knows where the next frame begins.
+/// Why the stream cannot be read further: after such a fault the start of the next frame is unknown.
 #[derive(Debug, thiserror::Error)]
 pub enum StreamFault {
-    /// A header that is none.
+    /// An invalid header.
     #[error(transparent)]
     Header(#[from] HeaderError),
-    /// Frames of another size than the rig's.
+    /// Frames of a size other than the rig's.
     #[error("frames of {}x{} pixels come, the rig has {}x{}", .found.0, .found.1, .expected.0, .expected.1)]
     Size {
         /// Size of the frames.
@@ -32,12 +32,12 @@ pub enum StreamFault {
         /// Size of the rig.
         expected: (u32, u32),
     },
-    /// The system refuses.
+    /// The system's error.
     #[error("the stream cannot be read ({0})")]
     Read(#[from] std::io::Error),
 }
 
-/// The frame that is coming in.
+/// Assembles the incoming frame.
 #[derive(Debug)]
 pub struct FrameReader {
     size: (u32, u32),
@@ -49,19 +49,19 @@ pub struct FrameReader {
 }
 
 impl FrameReader {
-    /// For frames of this size.
+    /// Creates a reader for frames of this size.
     pub fn new(size: (u32, u32)) -> Self {
         let header = [0; HEADER_BYTES];
         let picture = Vec::new();
         Self { size, header, header_filled: 0, current: None, picture, picture_filled: 0 }
     }
 
-    /// A new stream begins.
+    /// Prepares for a new stream.
     pub fn restart(&mut self) {
         (self.header_filled, self.picture_filled, self.current) = (0, 0, None);
     }
 
-    /// Reads on, up to the end of a frame. `stream` does not block.
+    /// Continues reading, up to the end of a frame. `stream` does not block.
     pub fn read(&mut self, stream: &mut impl Read) -> Result<Progress, StreamFault> {
         loop {
             let (into, filled) = match self.current {
@@ -87,7 +87,7 @@ impl FrameReader {
         }
     }
 
-    /// Goes from a whole header to its picture, and from a whole picture to the next header.
+    /// Advances from a complete header to its picture, and from a complete picture to the next header.
     fn advance(&mut self) -> Result<Option<StreamHeader>, StreamFault> {
         match self.current {
             None if self.header_filled == HEADER_BYTES => {
@@ -96,7 +96,7 @@ impl FrameReader {
                 if found != self.size {
                     return Err(StreamFault::Size { found, expected: self.size });
                 }
-                // Grows once: what a header may ask for is bounded by the size of the rig.
+                // Grows once: the size that a header may request is bounded by the size of the rig.
                 self.picture.resize(header.bytes as usize, 0);
                 self.picture_filled = 0;
                 self.current = Some(header);
@@ -111,7 +111,7 @@ impl FrameReader {
         }
     }
 
-    /// Exchanges the picture that is whole for a buffer that may be written.
+    /// Exchanges the complete picture for a buffer that may be written.
     pub fn swap_picture(&mut self, other: &mut Vec<u8>) {
         std::mem::swap(&mut self.picture, other);
     }
@@ -122,7 +122,7 @@ mod tests {
     use super::*;
     use crate::capture::stream::format::StreamClock;
 
-    /// Gives at most `step` bytes at a time, and nothing in between.
+    /// Returns at most `step` bytes at a time, with pauses in between.
     struct Trickle<'a> {
         bytes: &'a [u8],
         step: usize,
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_are_whole_wherever_the_bytes_are_cut() {
+    fn frames_are_complete_wherever_the_bytes_are_split() {
         let bytes = [frame(1, 10), frame(2, 20), frame(5, 50)].concat();
         for step in [1, 7, 63, 64, 65, 96, 1000] {
             let mut reader = FrameReader::new((8, 4));
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stream_that_is_none_and_another_size_are_faults() {
+    fn an_invalid_header_and_another_size_are_faults() {
         let mut reader = FrameReader::new((9, 4));
         let size = reader.read(&mut &frame(1, 1)[..]).unwrap_err();
         assert_eq!(size.to_string(), "frames of 8x4 pixels come, the rig has 9x4");

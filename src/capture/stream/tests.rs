@@ -1,4 +1,4 @@
-//! Streams as they come: whole, late, broken, and gone.
+//! Streams that are complete, late, damaged, or gone.
 
 use std::fs;
 use std::io::Write;
@@ -93,7 +93,7 @@ fn the_newest_frame_wins_and_losses_are_counted() {
 }
 
 #[test]
-fn stamps_of_each_clock_are_believed_as_far_as_they_go() {
+fn stamps_of_each_clock_become_instants_of_this_machine() {
     let arrival = 5_000_000_000;
     let realtime = 1_700_000_000_000_000_000;
     let of = |clock, stamp| stamp_of(&StreamHeader::gray(SIZE, clock, stamp, 0), arrival, realtime);
@@ -107,7 +107,7 @@ fn stamps_of_each_clock_are_believed_as_far_as_they_go() {
         of(StreamClock::Realtime, realtime - late),
         (arrival - late, clocks(arrival - late, realtime - late))
     );
-    // A clock that is a little ahead: no latency is negative, and the stamp stays as it came.
+    // A clock that is a little ahead: no latency is negative, and the stamp stays unchanged.
     assert_eq!(
         of(StreamClock::Realtime, realtime + late),
         (arrival + late, clocks(arrival, realtime + late))
@@ -142,7 +142,7 @@ fn colour_padding_and_jpeg_become_grey() {
     sender.write_all(&header.to_bytes()).unwrap();
     sender.write_all(&jpeg).unwrap();
     assert_eq!(scene.frame().1, 90);
-    // One that is torn is left out, and the next one comes.
+    // A torn one is skipped, and the next one arrives.
     sender.write_all(&StreamHeader { stamp_nanos: 3, ..header }.to_bytes()).unwrap();
     sender.write_all(&vec![0; jpeg.len()]).unwrap();
     assert_eq!(scene.wait(2000).unwrap(), Arrival::Frame);
@@ -153,7 +153,7 @@ fn colour_padding_and_jpeg_become_grey() {
 }
 
 #[test]
-fn a_sender_that_goes_or_falls_silent_is_a_state_and_another_may_come() {
+fn a_sender_that_leaves_or_falls_silent_is_a_state_and_another_may_connect() {
     let mut scene = scene();
     assert!(scene.absence().contains("nobody sends frames to"));
     let mut first = scene.sender();
@@ -166,7 +166,7 @@ fn a_sender_that_goes_or_falls_silent_is_a_state_and_another_may_come() {
     assert_eq!(scene.frame().1, 2);
     assert!(scene.source.take_notice().unwrap().text.contains("refused"));
     assert!(scene.absence().contains("no frame for"), "silence");
-    // The first hangs: who comes now takes its place.
+    // The first hangs: the next sender takes its place.
     let mut third = scene.sender();
     send(&mut third, StreamClock::Other, 3, 900, 3);
     assert_eq!(scene.frame().1, 3);
@@ -196,7 +196,7 @@ fn stamps_that_do_not_advance_are_refused_until_the_clock_has_stepped_for_good()
 }
 
 #[test]
-fn what_is_no_stream_is_disconnected_and_another_size_is_an_error() {
+fn an_invalid_stream_is_disconnected_and_another_size_is_an_error() {
     let mut scene = scene();
     let mut sender = scene.sender();
     sender.write_all(&[b'x'; 200]).unwrap();
@@ -214,7 +214,7 @@ fn what_is_no_stream_is_disconnected_and_another_size_is_an_error() {
 }
 
 #[test]
-fn a_socket_that_was_left_is_taken_over_and_a_file_is_not() {
+fn a_stale_socket_is_taken_over_and_a_file_is_not() {
     let folder = tempfile::tempdir().unwrap();
     let rig = folder.path().join("rig.toml");
     fs::write(&rig, RIG).unwrap();
@@ -251,7 +251,7 @@ fn program_scene(script: impl FnOnce(&Path) -> String) -> Scene {
 }
 
 #[test]
-fn a_program_is_started_again_when_it_ends_and_ends_with_its_stream() {
+fn a_program_is_restarted_when_it_ends_and_ends_with_its_stream() {
     let mut scene =
         program_scene(|frame| format!("cat {0}; echo x >> {0}.starts; exit 3", frame.display()));
     assert_eq!(scene.frame().1, 77);

@@ -1,7 +1,7 @@
-//! A camera as it comes and goes: opened, streaming, lost, opened again.
+//! A camera that appears and disappears: opened, streaming, lost, opened again.
 //!
-//! Nothing here waits longer than it is told to, and nothing that happens to the camera is an error,
-//! but one: a camera that has never given a frame and cannot, whatever it does, is a matter for the user.
+//! Nothing here waits longer than requested, and nothing that happens to the camera is an error, with one exception: a
+//! camera that has never delivered a frame and never can is a matter for the user.
 
 use std::collections::VecDeque;
 use std::os::fd::BorrowedFd;
@@ -17,18 +17,18 @@ use super::stamps::{FrameNumbers, MAX_REFUSED_IN_A_ROW, taken};
 use super::video_device::{Filled, OpenFailure, VideoDevice, VideoSystem};
 use crate::capture::source::{Absence, Arrival, FrameLosses, FrameStamp, Notice};
 
-/// Pause before the first attempt to open a camera again.
+/// Pause before the first attempt to reopen a camera.
 const FIRST_PAUSE_NANOS: i64 = 100_000_000;
-/// A camera that has streamed so long did not fail of its start: the pauses begin anew.
+/// A camera that streamed this long did not fail at its start: the pauses start anew.
 const HEALTHY_NANOS: i64 = 2_000_000_000;
-/// How often a value that the camera changes is read: a request to a USB camera takes a millisecond.
+/// Interval at which a value that the camera changes is read: a request to a USB camera takes a millisecond.
 const EXPOSURE_PERIOD_NANOS: i64 = 200_000_000;
 /// Pause after a wake-up without a frame.
 const IDLE_PAUSE_MILLIS: u32 = 1;
-/// Most notices that are kept for who asks: a camera that complains forever is heard often enough.
+/// Maximum number of notices kept: a camera that complains forever is heard often enough.
 const MAX_NOTICES: usize = 16;
 
-/// A frame that waits for its reader.
+/// A frame held for its reader.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Held {
     /// Its buffer.
@@ -42,7 +42,7 @@ struct Stream<D> {
     device: D,
     grant: Grant,
     num_buffers: usize,
-    /// Buffers that are to be given to the driver.
+    /// Buffers to be returned to the driver.
     idle: Vec<usize>,
     since_nanos: i64,
     newest_nanos: i64,
@@ -71,12 +71,12 @@ pub struct Camera<S: VideoSystem> {
     has_streamed: bool,
     is_stamped: bool,
     last_nanos: Option<i64>,
-    /// Frames refused since the last good one.
+    /// Frames refused since the last valid one.
     refused_in_a_row: u32,
 }
 
 impl<S: VideoSystem> Camera<S> {
-    /// A camera that is not open yet.
+    /// Creates a camera that is not open yet.
     pub fn new(system: S, name: String, params: CameraParams, wish: Wish) -> Self {
         Self {
             system,
@@ -95,18 +95,18 @@ impl<S: VideoSystem> Camera<S> {
         }
     }
 
-    /// What was lost so far.
+    /// Returns the losses so far.
     pub fn losses(&self) -> FrameLosses {
         self.losses
     }
 
-    /// The oldest remark that nobody has taken.
+    /// Takes the oldest remark.
     pub fn take_notice(&mut self) -> Option<Notice> {
         self.notices.pop_front()
     }
 
-    /// Waits for a frame, at most `millis`, or until `wake` can be read. Err where the camera can never
-    /// serve, with the reason.
+    /// Waits up to `millis` for a frame, or until `wake` can be read. An error, with the reason, if the camera can
+    /// never be used.
     pub fn await_frame(
         &mut self,
         wake: Option<BorrowedFd<'_>>,
@@ -132,7 +132,7 @@ impl<S: VideoSystem> Camera<S> {
         }
     }
 
-    /// Closes the camera, to be opened again after a pause.
+    /// Closes the camera, to be reopened after a pause.
     fn retire(&mut self, reason: String) -> Arrival {
         let now = self.system.now_nanos();
         if let State::Streaming(stream) = &self.state {
@@ -152,7 +152,7 @@ impl<S: VideoSystem> Camera<S> {
         note(&mut self.notices, text, true);
     }
 
-    /// Opens the camera and lets it stream.
+    /// Opens the camera and starts streaming.
     fn open(&mut self) -> Result<(), Absence> {
         let (path, mut device) =
             self.system.open(&self.name).map_err(|failure| open_failure(&self.name, failure))?;
@@ -211,7 +211,7 @@ impl<S: VideoSystem> Camera<S> {
         Ok(())
     }
 
-    /// One look at a camera that streams.
+    /// Checks a streaming camera once.
     fn look(&mut self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<Arrival, Absence> {
         let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
         if stream.held.is_some() {
@@ -241,8 +241,8 @@ impl<S: VideoSystem> Camera<S> {
         Ok(Arrival::Nothing)
     }
 
-    /// Locks what shall be locked, once the camera has settled, and reads the exposure again where it
-    /// changes by itself: when a frame has been handed on, and not only when none comes.
+    /// Locks the settings to be locked once the camera has settled, and reads the exposure again if the camera changes
+    /// it: also after a frame has been delivered, not only when none arrives.
     fn see_to_exposure(&mut self) {
         let now = self.system.now_nanos();
         let State::Streaming(stream) = &mut self.state else { return };
@@ -263,13 +263,13 @@ impl<S: VideoSystem> Camera<S> {
         notices.into_iter().for_each(|text| self.warn(text));
     }
 
-    /// Takes every buffer that is filled and holds the newest good one; how many there were.
+    /// Takes every filled buffer and holds the newest valid one; returns how many there were.
     fn drain(&mut self) -> Result<usize, Absence> {
         let State::Streaming(stream) = &mut self.state else { return Ok(0) };
         let mut count = 0;
         let arrival_nanos = self.system.now_nanos();
         let offset_nanos = self.params.stamp_offset_us.saturating_mul(1000);
-        // A camera may fill as fast as we look: no more than all buffers twice.
+        // A camera may fill buffers as fast as they are taken: no more than all buffers twice.
         for _ in 0..2 * stream.num_buffers {
             let filled = match stream.device.dequeue() {
                 Ok(filled) => filled,
@@ -283,8 +283,8 @@ impl<S: VideoSystem> Camera<S> {
             let mut taken = taken(&filled, arrival_nanos, stream.exposure.nanos, offset_nanos);
             let before = stream.held.map(|held| held.stamp.capture_nanos).or(self.last_nanos);
             if !taken.is_stamped || self.refused_in_a_row >= MAX_REFUSED_IN_A_ROW {
-                // Frames that were fetched together have arrived together; and a driver whose stamps have
-                // gone back for good is not blind forever.
+                // Frames fetched together have arrived together; and a driver whose stamps have gone back for good must
+                // not be refused forever.
                 taken.nanos =
                     before.map_or(taken.nanos, |before| taken.nanos.max(before.saturating_add(1)));
             }
@@ -318,8 +318,8 @@ impl<S: VideoSystem> Camera<S> {
         Ok(count)
     }
 
-    /// The frame that waits, its layout and its bytes: those that the driver says it has filled, none
-    /// where it says more than there are.
+    /// The held frame, its layout and its bytes: those that the driver reports as filled, none if it reports more than
+    /// there are.
     pub fn held(&self) -> Option<(Held, Grant, &[u8])> {
         let State::Streaming(stream) = &self.state else { return None };
         let held = stream.held?;
@@ -327,13 +327,13 @@ impl<S: VideoSystem> Camera<S> {
         Some((held, stream.grant, memory.get(..held.filled.used).unwrap_or(&[])))
     }
 
-    /// Gives the buffer of the frame that waits back to the driver; `is_broken` where it was no picture.
+    /// Returns the held frame's buffer to the driver; `is_broken` if it was not a picture.
     pub fn release(&mut self, is_broken: bool) {
         self.losses.broken += u64::from(is_broken);
         let State::Streaming(stream) = &mut self.state else { return };
         if let Some(held) = stream.held.take() {
             stream.idle.push(held.filled.index);
-            // What is refused is tried again at the next look, which also says what is wrong.
+            // A refusal is retried at the next check, which also reports it.
             let _ = stream.return_idle();
         }
     }
@@ -346,8 +346,8 @@ fn note(notices: &mut VecDeque<Notice>, text: String, is_warning: bool) {
 }
 
 impl<D: VideoDevice> Stream<D> {
-    /// Gives idle buffers to the driver. One that it refuses stays for the next look; a driver that has
-    /// none left, or is gone, is an absence.
+    /// Returns idle buffers to the driver. One that it refuses is kept for the next check; a driver that has none left,
+    /// or is gone, is an absence.
     fn return_idle(&mut self) -> Result<(), Absence> {
         let mut refused = None;
         let device = &mut self.device;
@@ -369,7 +369,7 @@ impl<D: VideoDevice> Stream<D> {
     }
 }
 
-/// What an error of the kernel means for a camera, and what to do.
+/// Explains an error of the kernel for a camera, and what to do.
 fn refusal(error: Errno, path: &dyn std::fmt::Display) -> String {
     match error {
         Errno::BUSY => format!("in use by another program, which `fuser {path}` names; end it"),

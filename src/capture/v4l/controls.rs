@@ -28,28 +28,28 @@ const WHITE_BALANCE_TEMPERATURE: u32 = 0x0098_091a;
 const FOCUS_AUTO: u32 = 0x009a_090c;
 /// `V4L2_CID_FOCUS_ABSOLUTE`.
 const FOCUS_ABSOLUTE: u32 = 0x009a_090a;
-/// `V4L2_CTRL_FLAG_VOLATILE`: the device changes the value, and reading gives its present value.
+/// `V4L2_CTRL_FLAG_VOLATILE`: the device changes the value, and reading returns its current value.
 const VOLATILE: u32 = 0x80;
 
 /// Microseconds of one step of the exposure control.
 const EXPOSURE_STEP_MICROS: i32 = 100;
 
-/// One thing that can be set, and that the camera may also find by itself.
+/// A setting that the camera may also control automatically.
 struct Knob {
     key: &'static str,
     name: &'static str,
-    /// The control that makes it automatic, its values for on in the order of trial, and for off.
+    /// The control of the automatic mode, its values for on in the order of trial, and for off.
     auto: (u32, &'static [i32], i32),
-    /// Controls that hold the value; the first that is there counts.
+    /// Controls that hold the value; the first that exists is used.
     values: &'static [u32],
-    /// The configuration's units in one step of the control.
+    /// Units of the configuration per step of the control.
     units_per_step: i32,
 }
 
 const EXPOSURE: Knob = Knob {
     key: "exposure_us",
     name: "exposure time",
-    // Aperture priority is what webcams have: the time is automatic, the aperture is not there.
+    // Webcams have aperture priority: the time is automatic, and there is no aperture.
     auto: (EXPOSURE_AUTO, &[3, 0], EXPOSURE_MANUAL),
     values: &[EXPOSURE_ABSOLUTE],
     units_per_step: EXPOSURE_STEP_MICROS,
@@ -76,7 +76,7 @@ const FOCUS: Knob = Knob {
     units_per_step: 1,
 };
 
-/// The settings with what they turn.
+/// The settings with their knobs.
 fn settings(params: &CameraParams) -> [(Setting, Knob); 4] {
     [
         (params.exposure_us, EXPOSURE),
@@ -86,15 +86,15 @@ fn settings(params: &CameraParams) -> [(Setting, Knob); 4] {
     ]
 }
 
-/// Sets everything that can be set at once; what the camera refuses, in words. A camera that lacks a
-/// control works without: brightness is estimated for every frame.
+/// Applies every setting that takes effect at once; returns the camera's refusals, in words. A camera that lacks a
+/// control works without it: brightness is estimated for every frame.
 pub fn apply(device: &mut dyn VideoDevice, params: &CameraParams) -> Vec<String> {
     if params.exposure_us != Setting::Leave && device.control(EXPOSURE_AUTO_PRIORITY).is_some() {
-        // A rate that falls in the dark is longer exposure by another name. Not all can.
+        // A rate that falls in the dark is a longer exposure by another name. Not all cameras can set it.
         let _ = device.set_value(EXPOSURE_AUTO_PRIORITY, 0);
     }
     let one = |(setting, knob): (Setting, Knob)| match setting {
-        // What is found first is kept later.
+        // The value that the camera finds first is kept later.
         Setting::Leave | Setting::Lock => None,
         Setting::Auto => knob.automatic(device).err(),
         Setting::Value(value) => knob.fix(device, value).err(),
@@ -102,12 +102,12 @@ pub fn apply(device: &mut dyn VideoDevice, params: &CameraParams) -> Vec<String>
     settings(params).into_iter().filter_map(one).collect()
 }
 
-/// Whether anything is to be locked once the camera has settled.
+/// Whether any setting is to be locked once the camera has settled.
 pub fn has_locks(params: &CameraParams) -> bool {
     settings(params).iter().any(|(setting, _)| *setting == Setting::Lock)
 }
 
-/// Keeps what the camera has found; what it refuses, in words.
+/// Keeps the values that the camera has found; returns its refusals, in words.
 pub fn lock(device: &mut dyn VideoDevice, params: &CameraParams) -> Vec<String> {
     let locked = settings(params).into_iter().filter(|(setting, _)| *setting == Setting::Lock);
     locked.filter_map(|(_, knob)| knob.keep(device).err()).collect()
@@ -163,7 +163,7 @@ impl Knob {
         device.set_value(id, off).map_err(|error| self.refused(error))
     }
 
-    /// Sets the value, in the configuration's units, to the nearest that the camera has.
+    /// Sets the value, in the configuration's units, to the nearest that the camera supports.
     fn fix(&self, device: &mut dyn VideoDevice, wanted: i32) -> Result<(), String> {
         let id = self.value_control(device)?;
         // First: the value of an automatic control cannot be set.
@@ -180,7 +180,7 @@ impl Knob {
         device.set_value(id, value).map_err(|error| self.refused(error))?;
         let granted = device.value(id).unwrap_or(value);
         let granted_units = i64::from(granted) * units;
-        // Within half a step of the control it is what was asked for.
+        // Within half a step of the control the value counts as granted.
         if (granted_units - i64::from(wanted)).abs() * 2 <= units * step {
             return Ok(());
         }
@@ -191,7 +191,7 @@ impl Knob {
         )))
     }
 
-    /// Ends the automatic and keeps its last value.
+    /// Ends the automatic mode and keeps its last value.
     fn keep(&self, device: &mut dyn VideoDevice) -> Result<(), String> {
         let found =
             self.value_control(device).ok().and_then(|id| Some((id, device.value(id).ok()?)));
@@ -200,14 +200,14 @@ impl Knob {
         }
         self.manual(device)?;
         match found {
-            // Cameras differ in what they fall back to.
+            // Cameras differ in the value that they fall back to.
             Some((id, value)) => device.set_value(id, value).map_err(|error| self.refused(error)),
             None => Ok(()),
         }
     }
 
-    /// The value in the configuration's units, where it is known: it was set, or the camera tells what
-    /// it chooses. Also whether it changes by itself.
+    /// Returns the value in the configuration's units, if it is known: it was set, or the camera reports its choice.
+    /// Also whether the value may change without being set.
     fn reading(&self, device: &dyn VideoDevice) -> Option<(i64, bool)> {
         let mut there = self.values.iter().filter_map(|&id| device.control(id));
         let control = there.find(|control| control.flags & CONTROL_WRITE_ONLY == 0)?;
@@ -221,18 +221,18 @@ impl Knob {
     }
 }
 
-/// What is known about the light of a frame.
+/// Exposure and gain of a frame, as far as known.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Exposure {
     /// Exposure time, nanoseconds; 0 where unknown.
     pub nanos: u64,
     /// Gain in the camera's steps; 0 where unknown.
     pub gain: f32,
-    /// Whether the camera changes it, so that it has to be read again.
+    /// Whether the camera changes it, so that it must be read again.
     pub changes: bool,
 }
 
-/// No camera that makes frames for this exposes longer than a second: what says so means another unit.
+/// No suitable camera exposes longer than a second: a longer time is in another unit.
 const LONGEST_EXPOSURE_NANOS: u64 = 1_000_000_000;
 
 /// Reads exposure time and gain.
@@ -260,7 +260,7 @@ mod tests {
         params
     }
 
-    /// A webcam: exposure in 100 µs steps, automatic at first, gain without automatic, no focus.
+    /// A webcam: exposure in 100 µs steps, automatic at first, gain without an automatic mode, no focus.
     fn webcam() -> Fake {
         Fake::default()
             .with_control(EXPOSURE_AUTO, "Auto Exposure", (0, 3, 1), 3, 0)
@@ -270,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fixed_exposure_is_set_by_hand_to_the_nearest_step() {
+    fn a_fixed_exposure_is_set_manually_to_the_nearest_step() {
         let fake = webcam();
         let mut device = fake.device();
         let refused = apply(&mut device, &params(|p| p.exposure_us = Setting::Value(8040)));
@@ -283,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn an_automatic_exposure_is_unknown_unless_the_camera_tells() {
+    fn an_automatic_exposure_is_unknown_unless_the_camera_reports_it() {
         assert_eq!(exposure(&webcam().device()).nanos, 0);
         let telling = webcam().with_control(
             EXPOSURE_ABSOLUTE,
@@ -297,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_out_of_range_is_set_to_the_end_and_said() {
+    fn a_value_out_of_range_is_clamped_and_reported() {
         let fake = webcam();
         let mut device = fake.device();
         let refused = apply(
@@ -319,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lock_keeps_what_was_found() {
+    fn a_lock_keeps_the_values_found() {
         let fake = webcam();
         let wish = params(|p| {
             p.exposure_us = Setting::Lock;
@@ -338,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_camera_refuses_is_said() {
+    fn refusals_of_a_camera_are_reported() {
         let fake = webcam();
         fake.refuse_controls(Errno::IO);
         let mut device = fake.device();
@@ -349,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn automatic_is_switched_on_in_the_way_that_the_camera_has() {
+    fn the_automatic_mode_is_set_to_a_value_that_the_camera_accepts() {
         let fake = webcam();
         fake.set(EXPOSURE_AUTO, EXPOSURE_MANUAL);
         fake.refuse_value(EXPOSURE_AUTO, 3);

@@ -16,16 +16,16 @@ use super::video_device::{
     PeriodRange, SizeRange, VideoDevice, VideoSystem,
 };
 
-/// Most entries of an enumeration that are believed: a driver without an end is broken.
+/// Maximum number of entries of an enumeration: a driver without an end is broken.
 const MAX_ENTRIES: u32 = 1024;
-/// Most buffers that are made.
+/// Maximum number of buffers.
 const MAX_BUFFERS: u32 = 32;
 
 /// Memory of the driver, mapped for reading.
 struct Mapping {
     start: NonNull<libc::c_void>,
     length: usize,
-    /// Whether the driver has it, and may write.
+    /// Whether the driver owns it, and may write.
     is_queued: bool,
 }
 
@@ -42,13 +42,13 @@ impl Drop for Mapping {
 
 /// An open device node.
 pub struct KernelDevice {
-    // Before the file, so that buffers are unmapped before they are given back.
+    // Before the file, so that buffers are unmapped before they are released.
     buffers: Vec<Mapping>,
     file: File,
 }
 
 impl KernelDevice {
-    /// Opens a node, without waiting for anything.
+    /// Opens a node, without blocking.
     pub fn open(path: &Path) -> Result<Self, Errno> {
         use rustix::fs::{Mode, OFlags};
         let flags = OFlags::RDWR | OFlags::NONBLOCK | OFlags::CLOEXEC;
@@ -56,7 +56,7 @@ impl KernelDevice {
         Ok(Self { buffers: Vec::new(), file: File::from(descriptor) })
     }
 
-    /// One request; the driver reads and writes `structure`.
+    /// Makes one request; the driver reads and writes `structure`.
     fn request<T: KernelStruct>(
         &self,
         request: &Request<T>,
@@ -76,7 +76,7 @@ impl KernelDevice {
         })
     }
 
-    /// Entry after entry, until the driver has no more.
+    /// Reads entry after entry, until the driver has no more.
     fn enumerate<T: KernelStruct, R>(
         &self,
         request: &Request<T>,
@@ -123,7 +123,7 @@ fn last_error() -> Errno {
     Errno::from_io_error(&std::io::Error::last_os_error()).unwrap_or(Errno::IO)
 }
 
-/// Again while a signal interrupts.
+/// Repeats a call that a signal interrupts.
 fn retry<T>(mut call: impl FnMut() -> Result<T, Errno>) -> Result<T, Errno> {
     loop {
         match call() {
@@ -141,7 +141,7 @@ fn blank_buffer(index: u32) -> kernel::Buffer {
     buffer
 }
 
-/// A text of the kernel: up to its zero.
+/// A text from the kernel, up to its zero byte.
 fn text(bytes: &[u8]) -> String {
     let end = bytes.iter().position(|&b| b == 0).unwrap_or(bytes.len());
     String::from_utf8_lossy(&bytes[..end]).trim().to_owned()
@@ -204,7 +204,7 @@ impl VideoDevice for KernelDevice {
                 _ => SizeRange { smallest: (a, d), largest: (b, e) },
             }
         });
-        // A range has one entry; some drivers give it again for every index.
+        // A range has one entry; some drivers return it again for every index.
         sizes.dedup();
         sizes
     }
@@ -230,7 +230,7 @@ impl VideoDevice for KernelDevice {
     fn set_layout(&mut self, code: FourCc, width: u32, height: u32) -> Result<Layout, Errno> {
         let mut format = kernel::Format::zeroed();
         format.buffer_type = kernel::BUFFER_TYPE_CAPTURE;
-        // All the rest zero: a stride or size that was left there would be taken for a wish.
+        // All other fields zero: a leftover stride or size would be taken for a request.
         // SAFETY: every bit pattern is a value of every member.
         let mut pix = unsafe { format.pix.pix };
         (pix.width, pix.height, pix.pixel_format) = (width, height, code.0);
@@ -349,7 +349,7 @@ impl VideoDevice for KernelDevice {
         let mut buffer = blank_buffer(0);
         self.request(&kernel::DEQUEUE_BUFFER, &mut buffer)?;
         let index = buffer.index as usize;
-        // A driver that names a buffer which it does not have is not to be believed.
+        // A driver that names a buffer that does not exist is not to be trusted.
         let mapping = self.buffers.get_mut(index).ok_or(Errno::IO)?;
         mapping.is_queued = false;
         Ok(Filled {
@@ -381,7 +381,7 @@ impl VideoDevice for KernelDevice {
             None => poll(&mut [own], millis)?,
             Some(wake) => poll(&mut [own, PollFd::from_borrowed_fd(wake, PollFlags::IN)], millis)?,
         };
-        // An error is ready too: the next dequeue names it.
+        // An error counts as ready too: the next dequeue reports it.
         Ok(!events.is_empty())
     }
 }
@@ -394,8 +394,8 @@ impl Drop for KernelDevice {
     }
 }
 
-/// What happened on the first descriptor within `millis`; nothing where a signal came. Without a descriptor it is a
-/// sleep.
+/// Returns the events on the first descriptor within `millis`; none if a signal interrupts. Without a descriptor it is
+/// a sleep.
 pub fn poll(descriptors: &mut [PollFd<'_>], millis: u32) -> Result<PollFlags, Errno> {
     let timeout = Timespec {
         tv_sec: i64::from(millis / 1000),
@@ -430,7 +430,7 @@ impl VideoSystem for Kernel {
     }
 
     fn pause(&self, wake: Option<BorrowedFd<'_>>, millis: u32) {
-        // What wakes is looked at by the caller.
+        // The caller checks what caused the wake-up.
         let mut polled = wake.map(|wake| PollFd::from_borrowed_fd(wake, PollFlags::IN));
         let _ = poll(polled.as_mut_slice(), millis);
     }
@@ -441,7 +441,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_no_camera_says_so_and_does_not_break() {
+    fn a_device_other_than_a_camera_gives_errors_without_a_panic() {
         let mut null = KernelDevice::open(Path::new("/dev/null")).unwrap();
         assert_eq!(null.capability().unwrap_err(), Errno::NOTTY);
         assert!(null.formats().is_empty() && null.controls().is_empty());
@@ -452,13 +452,13 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_is_not_there_is_missing() {
+    fn a_node_that_does_not_exist_is_missing() {
         let missing = Kernel.open("/dev/video-that-nobody-has").err();
         assert_eq!(missing, Some(OpenFailure::Missing));
     }
 
     #[test]
-    fn stamps_and_texts_of_the_kernel() {
+    fn stamps_and_texts_of_the_kernel_are_converted() {
         let stamp = libc::timeval { tv_sec: 3, tv_usec: 250_000 };
         assert_eq!(stamp_nanos(stamp), 3_250_000_000);
         assert_eq!(text(b"Vivid\0\0xx"), "Vivid");

@@ -1,19 +1,19 @@
-//! How a camera is named: by path, by number, or by what udev calls it.
+//! Names of cameras: a path, a number, or udev's name.
 
 use std::path::{Path, PathBuf};
 
 use super::video_device::OpenFailure;
 use crate::capture::input_file::entries;
 
-/// Folders of udev's names, in the order of trust: an id stays with the camera, a path with the plug.
+/// Folders of udev's names, in the order of preference: an id stays with the camera, a path with the port.
 pub const NAME_FOLDERS: [&str; 3] = ["v4l/by-id", "v4l/by-path", "semidense"];
-/// What udev adds to the name of a camera's first image node.
+/// Suffix that udev adds to the name of a camera's first image node.
 const FIRST_NODE: &str = "-video-index0";
 
-/// The node of a camera's name below `dev` (`/dev`): a path, a number (`0` is `video0`), `video0`, or a
-/// name in `v4l/by-id` or `v4l/by-path`, whole, without `-video-index0`, or the beginning of one only.
+/// Finds the node of a camera by its name below `dev` (`/dev`): a path, a number (`0` is `video0`), `video0`, or a name
+/// in `v4l/by-id`, `v4l/by-path` or `semidense`: complete, without `-video-index0`, or an unambiguous beginning.
 ///
-/// Looked up again before every opening: udev's names go and come with the camera.
+/// Looked up again before every opening: udev's names appear and disappear with the camera.
 pub fn find(dev: &Path, name: &str) -> Result<PathBuf, OpenFailure> {
     let number = name.strip_prefix("video").unwrap_or(name);
     if let Ok(number) = number.parse::<u32>() {
@@ -60,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_have_paths_numbers_and_ids() {
+    fn cameras_are_found_by_path_number_and_id() {
         let left = "v4l/by-id/usb-Maker_Cam_AA11-video-index0";
         let dev = dev(&[
             left,

@@ -1,4 +1,4 @@
-//! A fake camera: the test says what it offers, delivers and refuses.
+//! A fake camera: the test sets what it offers, delivers and refuses.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::os::fd::BorrowedFd;
@@ -17,10 +17,10 @@ use super::video_device::{
 /// Formats with sizes and the fastest rate.
 type Offer = (PixelFormat, Vec<(u32, u32)>, u32);
 
-/// The same as a test writes it.
+/// The same in the form that tests write.
 type OfferedHere<'a> = (PixelFormat, &'a [(u32, u32)], u32);
 
-/// What a driver does at a dequeue.
+/// Outcome of a dequeue.
 #[derive(Debug, Clone)]
 pub enum Event {
     /// A frame of these bytes and this number, with flags and the time since the stamp.
@@ -29,7 +29,7 @@ pub enum Event {
     Fails(Errno),
 }
 
-/// A good frame.
+/// A valid frame.
 pub fn frame(sequence: u32, bytes: Vec<u8>) -> Event {
     let (flags, age_nanos) = (FLAG_TIMESTAMP_MONOTONIC, 5_000_000);
     Event::Frame { bytes, used: None, sequence, flags, age_nanos }
@@ -53,7 +53,7 @@ struct Inner {
     is_open: bool,
 }
 
-/// The test's hand on the camera.
+/// The test's handle to the camera.
 #[derive(Debug, Clone)]
 pub struct Fake(Arc<Mutex<Inner>>);
 
@@ -156,7 +156,7 @@ impl Fake {
         self.inner().now_nanos
     }
 
-    /// How often it was opened.
+    /// Number of times it was opened.
     pub fn opened(&self) -> usize {
         self.inner().opened
     }
@@ -168,7 +168,7 @@ impl Fake {
 
 pub struct FakeDevice {
     fake: Fake,
-    /// Memory, and whether the driver has it.
+    /// Memory, and whether the driver owns it.
     buffers: Vec<(Vec<u8>, bool)>,
     is_streaming: bool,
 }
@@ -283,7 +283,7 @@ impl VideoDevice for FakeDevice {
             return Err(error);
         }
         let (_, is_queued) = self.buffers.get_mut(index).ok_or(Errno::INVAL)?;
-        // The mistake that ends a stream: a buffer that the driver has is not given again.
+        // The mistake that ends a stream: enqueueing a buffer that the driver owns.
         assert!(!std::mem::replace(is_queued, true), "buffer {index} is the driver's");
         Ok(())
     }

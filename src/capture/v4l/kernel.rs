@@ -1,8 +1,7 @@
-//! The part of `linux/videodev2.h` that a capture device is spoken to with: structures and request
-//! numbers.
+//! The part of `linux/videodev2.h` that a capture device needs: structures and request numbers.
 //!
-//! The header is the kernel's binary interface and does not change; a test holds every size, place and
-//! number against it where a C compiler is at hand, and against pinned values everywhere.
+//! The header is the kernel's binary interface and does not change; a test compares every size, offset and number with
+//! it if a C compiler is available, and with pinned values everywhere.
 
 /// `V4L2_BUF_TYPE_VIDEO_CAPTURE`.
 pub const BUFFER_TYPE_CAPTURE: u32 = 1;
@@ -17,7 +16,7 @@ pub const CAP_VIDEO_CAPTURE: u32 = 0x1;
 pub const CAP_VIDEO_CAPTURE_MPLANE: u32 = 0x1000;
 /// `V4L2_CAP_STREAMING`.
 pub const CAP_STREAMING: u32 = 0x0400_0000;
-/// `V4L2_CAP_DEVICE_CAPS`: `device_caps` speaks for this node alone.
+/// `V4L2_CAP_DEVICE_CAPS`: `device_caps` describes this node alone.
 pub const CAP_DEVICE_CAPS: u32 = 0x8000_0000;
 /// `V4L2_CAP_TIMEPERFRAME`: the rate can be set.
 pub const CAP_TIME_PER_FRAME: u32 = 0x1000;
@@ -41,10 +40,10 @@ pub const CONTROL_READ_ONLY: u32 = 0x4;
 pub const CONTROL_INACTIVE: u32 = 0x10;
 /// `V4L2_CTRL_FLAG_WRITE_ONLY`.
 pub const CONTROL_WRITE_ONLY: u32 = 0x40;
-/// `V4L2_CTRL_FLAG_NEXT_CTRL`: asks for the control after this one.
+/// `V4L2_CTRL_FLAG_NEXT_CTRL`: requests the control after this one.
 pub const CONTROL_NEXT: u32 = 0x8000_0000;
 
-/// `V4L2_CTRL_TYPE_INTEGER` and its neighbours, by what a control holds.
+/// `V4L2_CTRL_TYPE_INTEGER`: with those below, the type of a control's value.
 pub const CONTROL_TYPE_INTEGER: u32 = 1;
 /// `V4L2_CTRL_TYPE_BOOLEAN`.
 pub const CONTROL_TYPE_BOOLEAN: u32 = 2;
@@ -103,8 +102,7 @@ pub struct PixFormat {
 /// Bytes of the unions in [`Format`] and [`StreamParm`].
 const UNION_BYTES: usize = 200;
 
-/// `struct v4l2_format` with the single-plane member of its union. The union holds pointers, so it
-/// begins at the place of one.
+/// `struct v4l2_format` with the single-plane member of its union. The union holds pointers, so it is aligned like one.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct Format {
@@ -126,9 +124,9 @@ pub union FormatUnion {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Fraction {
-    /// Above the line.
+    /// Numerator.
     pub numerator: u32,
-    /// Below the line.
+    /// Denominator.
     pub denominator: u32,
 }
 
@@ -191,7 +189,7 @@ pub struct Buffer {
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub union BufferUnion {
-    /// MMAP: what `mmap` takes as offset.
+    /// MMAP: the offset for `mmap`.
     pub offset: u32,
     pub pointer: usize,
 }
@@ -254,12 +252,12 @@ pub struct FramePeriodEnumeration {
     pub reserved: [u32; 2],
 }
 
-/// A kernel structure: plain numbers, for which all bits zero are a value.
+/// A kernel structure: plain numbers, for which all-zero bits are a value.
 ///
 /// # Safety
 /// The type is `repr(C)` and every bit pattern of it is valid.
 pub unsafe trait KernelStruct: Copy {
-    /// All bits zero, as the interface wants its reserved fields.
+    /// All bits zero, as the interface requires of reserved fields.
     fn zeroed() -> Self {
         // SAFETY: by the trait's contract every bit pattern is a value.
         unsafe { std::mem::zeroed() }
@@ -294,7 +292,7 @@ pub struct Request<T> {
     structure: std::marker::PhantomData<T>,
 }
 
-/// `_IOC(direction, 'V', number, size)` of Linux's generic encoding: x86-64 and ARM64 have it.
+/// `_IOC(direction, 'V', number, size)` in Linux's generic encoding, which x86-64 and ARM64 use.
 const fn request<T>(direction: u64, number: u64) -> Request<T> {
     let size = size_of::<T>() as u64;
     let number = direction << 30 | size << 16 | (b'V' as u64) << 8 | number;
@@ -345,7 +343,7 @@ mod tests {
     use std::mem::offset_of;
     use std::process::Command;
 
-    /// What the kernel's header says on 64-bit machines, as a C expression and a number, beside ours.
+    /// The values of the kernel's header on 64-bit machines, as a C expression and a number, next to ours.
     fn layout() -> Vec<(&'static str, u64, u64)> {
         let size = |bytes: usize| bytes as u64;
         vec![
@@ -466,7 +464,7 @@ mod tests {
         std::fs::write(&source, program).unwrap();
         let compiled = Command::new("cc").arg(&source).arg("-o").arg(&binary).output();
         if !compiled.as_ref().is_ok_and(|output| output.status.success()) {
-            // No C compiler or no kernel headers: the pinned numbers, taken from them, must do.
+            // No C compiler or no kernel headers: the pinned numbers, taken from them, must suffice.
             return;
         }
         let printed = Command::new(&binary).output().unwrap();

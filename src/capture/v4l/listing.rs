@@ -1,4 +1,4 @@
-//! The cameras of this machine: who they are, what they offer, whether they can be opened.
+//! The cameras of this machine: their identity, what they offer, whether they can be opened.
 
 use std::path::{Path, PathBuf};
 
@@ -20,10 +20,10 @@ use crate::capture::input_file::entries;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Access {
-    /// It can be opened, and nobody else streams from it.
+    /// It can be opened, and no other program streams from it.
     #[default]
     Free,
-    /// Another program has its buffers.
+    /// Another program holds its buffers.
     Busy,
     /// This user may not open it.
     Forbidden,
@@ -36,14 +36,14 @@ pub enum Access {
 pub struct SizeReport {
     /// The size, or the smallest and the largest.
     pub size: String,
-    /// Frames a second that it can have, the most first; empty where the driver does not say.
+    /// Supported frames per second, highest first; empty if the driver does not report them.
     pub rates_hz: Vec<f64>,
 }
 
 /// A format.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FormatReport {
-    /// Its four letters.
+    /// Its four-letter code.
     pub code: String,
     /// Its name.
     pub description: String,
@@ -68,20 +68,20 @@ pub struct ControlReport {
     pub step: i32,
     /// Value after plugging in.
     pub default: i32,
-    /// Present value, where it can be read.
+    /// Current value, if it can be read.
     pub value: Option<i32>,
-    /// Whether it cannot be set now: it is read-only, or an automatic has it.
+    /// Whether it cannot be set now: it is read-only, or controlled automatically.
     pub fixed: bool,
     /// Names of a menu's values.
     pub items: Vec<(u32, String)>,
 }
 
-/// A video node that gives pictures, or could not be asked.
+/// A video node that delivers pictures, or could not be queried.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct CameraReport {
     /// The node.
     pub path: PathBuf,
-    /// udev's names for it, as `v4l:NAME` takes them.
+    /// udev's names for it, as used in `v4l:NAME`.
     pub names: Vec<String>,
     /// Whether it can be used.
     pub access: Access,
@@ -93,9 +93,9 @@ pub struct CameraReport {
     pub driver: String,
     /// Where it is plugged in.
     pub bus: String,
-    /// What it offers.
+    /// The formats that it offers.
     pub formats: Vec<FormatReport>,
-    /// What can be set.
+    /// Its controls.
     pub controls: Vec<ControlReport>,
 }
 
@@ -110,12 +110,12 @@ pub fn nodes(dev: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// Every camera below `dev`, and every node that cannot be asked whether it is one.
+/// Every camera below `dev`, and every node that cannot be queried.
 pub fn cameras(dev: &Path) -> Vec<CameraReport> {
     nodes(dev).iter().filter_map(|path| report(dev, path)).collect()
 }
 
-/// Whether a node can be used; `None` for what is not a camera.
+/// Whether a node can be used; `None` if it is not a camera.
 pub fn access(path: &Path) -> Option<Access> {
     open(path).map(|(_, problem)| access_of(problem))
 }
@@ -129,7 +129,7 @@ fn access_of(problem: Option<Errno>) -> Access {
     }
 }
 
-/// The device of a node, where it can be opened, and why it cannot be used; `None` for what is not a camera.
+/// Opens a node: its device, if it can be opened, and why it cannot be used; `None` if it is not a camera.
 fn open(path: &Path) -> Option<(Option<KernelDevice>, Option<Errno>)> {
     let mut device = match KernelDevice::open(path) {
         Ok(device) => device,
@@ -139,7 +139,7 @@ fn open(path: &Path) -> Option<(Option<KernelDevice>, Option<Errno>)> {
     if flags & (CAP_VIDEO_CAPTURE | CAP_VIDEO_CAPTURE_MPLANE) == 0 {
         return None;
     }
-    // A device without buffers of ours is busy where another program has some.
+    // A device without buffers of ours is busy if another program has some.
     let busy = device.make_buffers(0).err().filter(|error| *error == Errno::BUSY);
     Some((Some(device), busy))
 }
@@ -159,7 +159,7 @@ fn report(dev: &Path, path: &Path) -> Option<CameraReport> {
     Some(found)
 }
 
-/// What a device says of itself.
+/// Reads what a device reports about itself.
 fn describe(device: &dyn VideoDevice, found: &mut CameraReport) {
     if let Ok(capability) = device.capability() {
         (found.card, found.driver, found.bus) =
@@ -229,14 +229,14 @@ mod tests {
     use crate::capture::v4l::fake::Fake;
 
     #[test]
-    fn nodes_are_counted_and_not_spelled() {
+    fn nodes_are_sorted_by_number_and_not_by_name() {
         let dev = tempfile::tempdir().unwrap();
         for name in ["video10", "video2", "video", "videox", "video-cam", "vbi0"] {
             std::fs::write(dev.path().join(name), "").unwrap();
         }
         assert_eq!(nodes(dev.path()), [dev.path().join("video2"), dev.path().join("video10")]);
         assert!(nodes(Path::new("/nowhere")).is_empty());
-        // A file that is no device is not a camera.
+        // A file that is not a device is not a camera.
         assert_eq!(cameras(dev.path()), []);
     }
 
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_says_what_it_offers() {
+    fn a_camera_reports_what_it_offers() {
         let fake = Fake::with_formats(&[(PixelFormat::Yuyv, &[(640, 480), (320, 240)], 30)])
             .with_control(0x0098_0913, "Gain", (0, 100, 5), 40, 0);
         let mut found = CameraReport::default();

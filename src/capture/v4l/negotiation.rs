@@ -1,4 +1,4 @@
-//! What a camera is asked for, and what it grants: format, size, rate.
+//! The request to a camera and what it grants: format, size, rate.
 
 use rustix::io::Errno;
 
@@ -6,12 +6,12 @@ use super::kernel::{CAP_STREAMING, CAP_VIDEO_CAPTURE, CAP_VIDEO_CAPTURE_MPLANE};
 use super::pixel_format::{PixelFormat, is_usable};
 use super::video_device::{Fraction, Layout, SizeRange, VideoDevice, rate_hz};
 
-/// A rate within this share of the wish is the one that was asked for: 29.97 for 30.
+/// Share of the requested rate within which a granted one counts as equal: 29.97 for 30.
 const RATE_TOLERANCE: f64 = 0.05;
-/// Rates are asked for in thousandths of a hertz.
+/// Rates are requested in thousandths of a hertz.
 const MILLIHERTZ: f64 = 1000.0;
 
-/// What is wanted.
+/// The request.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Wish {
     /// Width, pixels.
@@ -20,25 +20,25 @@ pub struct Wish {
     pub height: u32,
     /// Format; `None` for the best.
     pub format: Option<PixelFormat>,
-    /// Frames a second; `None` for the camera's own.
+    /// Frames per second; `None` for the camera's own.
     pub rate_hz: Option<f64>,
 }
 
-/// What was granted.
+/// The grant.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Grant {
     /// Format.
     pub format: PixelFormat,
     /// Bytes from row to row.
     pub stride: usize,
-    /// Frames a second, where the driver says.
+    /// Frames per second, if the driver reports it.
     pub rate_hz: Option<f64>,
 }
 
-/// Why a camera does not serve.
+/// Why a camera cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum NegotiationError {
-    /// No capture device that streams.
+    /// Not a capture device that streams.
     #[error("is not a camera that can be used: {0}")]
     NoCamera(&'static str),
     /// None of our formats.
@@ -46,13 +46,13 @@ pub enum NegotiationError {
         "offers {offered}, none of the formats asked for; set capture.camera.format = \"auto\""
     )]
     NoFormat {
-        /// What it offers.
+        /// The formats offered.
         offered: String,
     },
     /// Not the rig's size.
     #[error("delivers {found} instead of {wanted}; it offers {offered}")]
     Size {
-        /// What it gives.
+        /// The layout that it delivers.
         found: String,
         /// The rig's size.
         wanted: String,
@@ -64,8 +64,8 @@ pub enum NegotiationError {
     Device(Errno),
 }
 
-/// Asks for format, size and rate, and checks what is granted. A rate that is not granted is no error;
-/// the grant tells it.
+/// Requests format, size and rate, and checks the grant. A rate that is not granted is not an error; the grant contains
+/// the actual one.
 pub fn negotiate(device: &mut dyn VideoDevice, wish: &Wish) -> Result<Grant, NegotiationError> {
     check_capability(device)?;
     let (format, layout) = agree_on_layout(device, wish)?;
@@ -73,7 +73,7 @@ pub fn negotiate(device: &mut dyn VideoDevice, wish: &Wish) -> Result<Grant, Neg
     Ok(Grant { format, stride: layout.stride as usize, rate_hz })
 }
 
-/// Whether a granted rate is not the one that was asked for.
+/// Whether a granted rate differs from the requested one.
 pub fn rate_differs(wanted: Option<f64>, granted: Option<f64>) -> bool {
     let pair = wanted.zip(granted);
     pair.is_some_and(|(wanted, granted)| (granted - wanted).abs() > RATE_TOLERANCE * wanted)
@@ -95,8 +95,8 @@ fn check_capability(device: &dyn VideoDevice) -> Result<(), NegotiationError> {
     Err(no_camera(problem))
 }
 
-/// Formats in the order of trial: those that reach the rate in their order, then the fastest of the
-/// others. A driver that does not say what it offers is asked for all.
+/// Formats in the order of trial: those that reach the rate in their order, then the others, fastest first. If a driver
+/// does not report what it offers, all are tried.
 fn candidates(device: &dyn VideoDevice, wish: &Wish) -> Vec<PixelFormat> {
     let offered = device.formats();
     let is_wanted = |format: &PixelFormat| {
@@ -118,7 +118,7 @@ fn candidates(device: &dyn VideoDevice, wish: &Wish) -> Vec<PixelFormat> {
             (format, shortfall.max(0.0))
         })
         .collect();
-    // Stable: who reaches the rate stays in order.
+    // Stable: formats that reach the rate keep their order.
     found.sort_by(|a, b| a.1.total_cmp(&b.1));
     found.into_iter().map(|(format, _)| format).collect()
 }
@@ -130,7 +130,7 @@ fn agree_on_layout(
     let mut found: Option<Layout> = None;
     for format in candidates(device, wish) {
         match device.set_layout(format.code(), wish.width, wish.height) {
-            // This format or size is not there; another may be.
+            // This format or size is not available; another may be.
             Err(Errno::INVAL) => {}
             Err(error) => return Err(NegotiationError::Device(error)),
             Ok(layout) if layout.code != format.code() => {}
@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cheapest_format_that_reaches_the_rate_is_taken() {
+    fn the_cheapest_format_that_reaches_the_rate_is_chosen() {
         // A webcam: raw pictures slowly, compressed ones fast.
         let webcam = Fake::with_formats(&[
             (PixelFormat::Mjpeg, &[(640, 480)], 30),
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn another_size_is_refused_with_those_that_there_are() {
+    fn another_size_is_refused_with_the_sizes_offered() {
         let camera = Fake::with_formats(&[(PixelFormat::Yuyv, &[(320, 240), (1280, 720)], 30)]);
         let error = negotiate(&mut camera.device(), &wish(None, None)).unwrap_err();
         assert_eq!(
@@ -228,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_camera_is_named_so() {
+    fn devices_other_than_cameras_are_reported_as_such() {
         let fake = Fake::with_formats(&[(PixelFormat::Grey, &[(640, 480)], 30)]);
         let refused = |flags| {
             fake.set_capability_flags(flags);
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn a_busy_camera_is_no_matter_of_formats() {
+    fn a_busy_camera_is_not_a_format_error() {
         let fake = Fake::with_formats(&[(PixelFormat::Grey, &[(640, 480)], 30)]);
         fake.refuse_layout(Errno::BUSY);
         let error = negotiate(&mut fake.device(), &wish(None, None)).unwrap_err();

@@ -1,4 +1,4 @@
-//! Everything that can be set about a camera of the kernel.
+//! Parameters of a kernel camera.
 
 use std::fmt;
 
@@ -8,16 +8,16 @@ use serde::{Deserialize, Deserializer, Serialize};
 use super::pixel_format::PixelFormat;
 use crate::slam::parameter::{ParameterError, check_range};
 
-/// A setting of the camera that it can also find by itself.
+/// A setting that the camera can also control automatically.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Setting {
-    /// As it is.
+    /// Unchanged.
     #[default]
     Leave,
-    /// The camera finds it, again and again.
+    /// The camera controls it continuously.
     Auto,
-    /// What the camera has found after the settling time is kept.
+    /// The value that the camera has found after the settling time is kept.
     Lock,
     /// This value.
     #[serde(untagged)]
@@ -52,7 +52,7 @@ impl<'de> Deserialize<'de> for Setting {
     }
 }
 
-/// The format that a camera is asked for.
+/// The format requested of a camera.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FormatChoice {
@@ -78,7 +78,7 @@ pub enum FormatChoice {
 }
 
 impl FormatChoice {
-    /// The format, where one is named.
+    /// The format, if one is named.
     pub fn format(self) -> Option<PixelFormat> {
         match self {
             Self::Auto => None,
@@ -94,37 +94,36 @@ impl FormatChoice {
     }
 }
 
-/// What is asked of a camera. Its size is the rig's: a calibration holds for one size.
+/// Settings requested of a camera. The size is the rig's: a calibration holds for one size.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CameraParams {
-    /// Buffers that the driver fills in turn, 3 to 5. Three are enough where capture is never held up
-    /// for more than a frame; each more is one frame that survives a longer pause.
+    /// Buffers that the driver fills in rotation, 3 to 5. Three are enough if capture is never held up for more than a
+    /// frame; each further one saves one frame in a longer pause.
     pub buffers: u32,
     /// auto, grey, y10, y12, y16, yuyv, uyvy, nv12 or mjpeg. Auto takes the first of grey, nv12, yuyv,
     /// uyvy, y10, y12, y16, mjpeg that has the rig's size and reaches the rate.
     pub format: FormatChoice,
-    /// Frames a second; 0 is the rig's `rate_hz`, and without that the camera's own.
+    /// Frames per second; 0 is the rig's `rate_hz`, and without that the camera's own.
     pub rate_hz: f64,
-    /// Exposure time: leave, auto, lock (what the camera has found after `settle_s` is kept), or
-    /// microseconds. A fixed one keeps grey levels and stamps steady; keep it below 10 ms, as motion blurs.
+    /// Exposure time: leave, auto, lock (the value that the camera has found after `settle_s` is kept), or
+    /// microseconds. A fixed one keeps grey levels and stamps steady; keep it below 10 ms because of motion blur.
     pub exposure_us: Setting,
     /// Gain: leave, auto, lock, or a value in the camera's steps (`semidense cameras` lists the range).
     pub gain: Setting,
-    /// White balance: leave, auto, lock, or a colour temperature in kelvin. It shifts the grey levels of
-    /// coloured things.
+    /// White balance: leave, auto, lock, or a colour temperature in kelvin. It shifts the grey levels of coloured
+    /// objects.
     pub white_balance_k: Setting,
     /// Focus: leave, auto, lock, or a value in the camera's steps. A focus that moves changes the
     /// calibration.
     pub focus: Setting,
-    /// Seconds of streaming after which `lock` keeps what the camera has found; automatic exposure needs
+    /// Seconds of streaming after which `lock` keeps the value that the camera has found; automatic exposure needs
     /// about one.
     pub settle_s: f64,
-    /// What is added to every stamp, microseconds, after it was moved to the middle of the exposure: the
-    /// delay that a calibration of the stamps has found, as minus half the readout of a rolling shutter.
+    /// Offset added to every stamp, microseconds, after it was moved to the middle of the exposure: the delay found by
+    /// a calibration of the stamps, such as minus half the readout of a rolling shutter.
     pub stamp_offset_us: i64,
-    /// A camera that streams but gives no frame for so long is opened again, seconds; longer than the
-    /// longest exposure.
+    /// Seconds without a frame after which a streaming camera is reopened; longer than the longest exposure.
     pub stall_s: f64,
     /// Longest pause between two attempts to open a camera, seconds; the first is 0.1 and they double.
     pub retry_s: f64,

@@ -1,4 +1,4 @@
-//! The pixel formats that cameras give, and their grey values.
+//! The pixel formats of cameras, and their grey values.
 
 use super::kernel::FIELD_NONE;
 use super::video_device::{FourCc, Layout};
@@ -12,11 +12,11 @@ pub enum PixelFormat {
     Grey,
     /// A plane of luma, then one of chroma (4:2:0).
     Nv12,
-    /// Luma and chroma in turn (4:2:2), luma first.
+    /// Alternating luma and chroma (4:2:2), luma first.
     Yuyv,
     /// The same, chroma first.
     Uyvy,
-    /// 10 bits of grey in two bytes, little endian.
+    /// 10 bits of grey in two bytes, little-endian.
     Y10,
     /// 12 bits of grey in two bytes.
     Y12,
@@ -70,7 +70,7 @@ impl PixelFormat {
     pub(in crate::capture) fn row_bytes(self, width: usize) -> Option<usize> {
         match self {
             Self::Grey | Self::Nv12 => Some(width),
-            // 4:2:2 without the last chroma: the last luma of an odd width is there nevertheless.
+            // 4:2:2 without the last chroma: the last luma of an odd width is present nevertheless.
             Self::Yuyv | Self::Uyvy | Self::Y10 | Self::Y12 | Self::Y16 => width.checked_mul(2),
             Self::Rgb3 | Self::Bgr3 => width.checked_mul(3),
             Self::Mjpeg => None,
@@ -81,15 +81,15 @@ impl PixelFormat {
 /// Why a buffer is not a picture.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum BrokenPicture {
-    /// Fewer bytes than the picture has.
+    /// Fewer bytes than the picture needs.
     #[error("only {found} of {needed} bytes came")]
     Short {
-        /// Bytes that came.
+        /// Bytes received.
         found: usize,
-        /// Bytes that are needed.
+        /// Bytes needed.
         needed: usize,
     },
-    /// Rows or sizes that do not fit each other.
+    /// Rows or sizes that do not match.
     #[error("rows of {stride} bytes for {width} pixels of {format:?}")]
     Stride {
         /// Bytes from row to row.
@@ -99,7 +99,7 @@ pub enum BrokenPicture {
         /// Their format.
         format: PixelFormat,
     },
-    /// A JPEG that is torn, or none.
+    /// A torn or invalid JPEG.
     #[error("{0}")]
     Jpeg(String),
 }
@@ -107,8 +107,8 @@ pub enum BrokenPicture {
 /// Writes the grey values of a picture, `width * height` of them, row by row. Formats of more than
 /// eight bits keep their upper eight.
 ///
-/// `bytes` is what the driver says it has filled, `stride` the granted bytes from row to row; neither
-/// is believed. `samples` is reused memory of the JPEG decoder.
+/// `bytes` is what the driver reports as filled, `stride` the granted bytes from row to row; neither is trusted.
+/// `samples` is reused memory of the JPEG decoder.
 pub fn unpack_gray(
     format: PixelFormat,
     bytes: &[u8],
@@ -124,7 +124,7 @@ pub fn unpack_gray(
     if stride < row_bytes || width == 0 || gray.len() != width * height {
         return Err(BrokenPicture::Stride { stride, width, format });
     }
-    // The last row needs no padding behind it.
+    // The last row needs no padding after it.
     let needed = height.saturating_sub(1).saturating_mul(stride).saturating_add(row_bytes);
     if bytes.len() < needed {
         return Err(BrokenPicture::Short { found: bytes.len(), needed });
@@ -164,14 +164,14 @@ fn gray_from_bgr(row: &[u8], gray: &mut [u8]) {
     }
 }
 
-/// Little-endian values without their lower `SHIFT` bits; what is more than eight bits is white.
+/// Little-endian values without their lower `SHIFT` bits; values that exceed eight bits are white.
 fn upper_bits<const SHIFT: u32>(row: &[u8], gray: &mut [u8]) {
     for (gray, pair) in gray.iter_mut().zip(row.chunks_exact(2)) {
         *gray = (u16::from_le_bytes([pair[0], pair[1]]) >> SHIFT).min(255) as u8;
     }
 }
 
-/// Whether a granted layout is of whole pictures whose rows can hold their pixels.
+/// Whether a granted layout has whole pictures whose rows can hold their pixels.
 pub fn is_usable(layout: &Layout) -> bool {
     let Some(format) = PixelFormat::of(layout.code) else { return false };
     let row_bytes = format.row_bytes(layout.width as usize);
@@ -279,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn a_grant_is_whole_pictures_with_room_for_their_rows() {
+    fn a_usable_grant_has_whole_pictures_with_room_for_their_rows() {
         let layout = |code: &[u8; 4], stride, field| Layout {
             code: FourCc::new(code),
             width: 640,

@@ -1,13 +1,13 @@
-//! When a frame was taken, and its number.
+//! Stamps and numbers of frames.
 
 use super::kernel::{
     FLAG_STAMP_SOURCE_MASK, FLAG_STAMP_START, FLAG_TIMESTAMP_MASK, FLAG_TIMESTAMP_MONOTONIC,
 };
 use super::video_device::Filled;
 
-/// A stamp further than this from the frame's arrival is not of this clock, or not of this frame: no
-/// camera takes a second from the exposure to the buffer. Drivers are off by a frame period in either
-/// direction (vivid's stamps lie in the future), which is believed.
+/// A stamp farther than this from the frame's arrival is from another clock or another frame: no camera takes a second
+/// from the exposure to the buffer. Drivers are off by a frame period in either direction (vivid's stamps lie in the
+/// future), which is accepted.
 const PLAUSIBLE_NANOS: u64 = 1_000_000_000;
 
 /// The middle of a frame's exposure, nanoseconds of CLOCK_MONOTONIC.
@@ -15,12 +15,12 @@ const PLAUSIBLE_NANOS: u64 = 1_000_000_000;
 pub struct Taken {
     /// The instant.
     pub nanos: i64,
-    /// Whether it is the driver's; otherwise it is the frame's arrival, which is later and jitters.
+    /// Whether it is from the driver; otherwise it is the frame's arrival, which is later and jitters.
     pub is_stamped: bool,
 }
 
-/// When a frame was taken: the driver's stamp moved from the start of the exposure, or from its end, to
-/// the middle. `exposure_nanos` is 0 where unknown; `offset_nanos` is what a calibration has found.
+/// Returns when a frame was taken: the driver's stamp moved from the start of the exposure, or from its end, to the
+/// middle. `exposure_nanos` is 0 where unknown; `offset_nanos` comes from a calibration.
 pub fn taken(filled: &Filled, arrival_nanos: i64, exposure_nanos: u64, offset_nanos: i64) -> Taken {
     let is_monotonic = filled.flags & FLAG_TIMESTAMP_MASK == FLAG_TIMESTAMP_MONOTONIC;
     let is_stamped = is_monotonic && filled.stamp_nanos.abs_diff(arrival_nanos) <= PLAUSIBLE_NANOS;
@@ -31,22 +31,22 @@ pub fn taken(filled: &Filled, arrival_nanos: i64, exposure_nanos: u64, offset_na
     Taken { nanos: stamp.saturating_add(to_middle).saturating_add(offset_nanos), is_stamped }
 }
 
-/// Numbers that never go back, from a driver's that begin anew whenever it streams.
+/// Numbers that never go back, from a driver's numbers, which restart with every stream.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct FrameNumbers {
     next: u64,
     last: Option<u32>,
 }
 
-/// Frames whose stamps go back are refused; after so many in a row, a third of a second, it is the clock that has
+/// Frames whose stamps go back are refused; after this many in a row, a third of a second, the clock is taken to have
 /// stepped.
 pub const MAX_REFUSED_IN_A_ROW: u32 = 10;
 
-/// A larger step of the driver's number is a new beginning, not a loss: ten minutes at 60 Hz.
+/// A larger step of the driver's number is a restart, not a loss: ten minutes at 60 Hz.
 const MAX_STEP: u32 = 36_000;
 
 impl FrameNumbers {
-    /// The number of a frame, and how many frames before it never came.
+    /// Returns the number of a frame, and how many frames are missing before it.
     pub fn number(&mut self, sequence: u32) -> (u64, u64) {
         let step = match self.last {
             None => 1,
@@ -63,7 +63,7 @@ impl FrameNumbers {
         (number, missing)
     }
 
-    /// The stream begins anew: how much was missed is not known, so that one number is left out.
+    /// Begins a new stream: how many frames were missed is unknown, so one number is skipped.
     pub fn restart(&mut self) {
         if self.last.take().is_some() {
             self.next = self.next.saturating_add(1);
@@ -108,7 +108,7 @@ mod tests {
             let found = taken(&filled(stamp, flags), ARRIVAL, exposure, 0);
             assert_eq!(found, Taken { nanos: ARRIVAL - 4_000_000, is_stamped: false }, "{stamp}");
         }
-        // A frame period in the future, as vivid gives it.
+        // A frame period in the future, as vivid stamps it.
         assert!(taken(&filled(ARRIVAL + 34_000_000, MONOTONIC), ARRIVAL, 0, 0).is_stamped);
         let hostile = taken(&filled(i64::MAX, MONOTONIC), i64::MAX, u64::MAX, i64::MAX);
         assert_eq!(hostile.nanos, i64::MAX);

@@ -27,7 +27,7 @@ fn offering(format: PixelFormat) -> Fake {
     Fake::with_formats(&[(format, &[(WIDTH as u32, HEIGHT as u32)], 30)])
 }
 
-/// Different at every pixel.
+/// A picture whose neighbouring pixels differ.
 fn picture() -> Vec<u8> {
     (0..WIDTH * HEIGHT).map(|i| (i * 7 % 251) as u8).collect()
 }
@@ -61,7 +61,7 @@ fn every_format_gives_the_same_picture() {
         let (pixels, stamp) = next(&fake, &mut source(&fake, PINHOLE), frame(0, bytes.clone()));
         assert!(pixels == gray, "{format:?}");
         assert_eq!(stamp.capture_nanos, fake.now_nanos() - 5_000_000, "{format:?}");
-        // With a lens the same again, rectified.
+        // With a lens, the same picture rectified.
         let (rectified, _) = next(&fake, &mut source(&fake, RADTAN), frame(0, bytes));
         let mut expected = vec![0; WIDTH * HEIGHT];
         Rectification::new(&rig(RADTAN).camera).unwrap().rectify_into(&gray, &mut expected);
@@ -101,7 +101,7 @@ fn a_torn_picture_is_one_error_and_the_next_frame_follows() {
 }
 
 #[test]
-fn short_buffers_are_broken_frames() {
+fn short_buffers_are_damaged_frames() {
     for format in [PixelFormat::Grey, PixelFormat::Yuyv, PixelFormat::Nv12, PixelFormat::Y16] {
         for lens in [PINHOLE, RADTAN] {
             let fake = offering(format);

@@ -1,5 +1,5 @@
-//! What a capture device does, call by call. The kernel's devices are those of `device.rs`;
-//! everything that decides works on this trait and is tested with a fake device.
+//! The interface of a capture device, call by call. `device.rs` implements it for the kernel's devices; everything that
+//! decides works on this trait and is tested with a fake device.
 
 use std::fmt;
 use std::os::fd::BorrowedFd;
@@ -35,7 +35,7 @@ impl fmt::Debug for FourCc {
     }
 }
 
-/// Who a device is.
+/// Identity of a device.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Capability {
     /// The kernel driver.
@@ -44,7 +44,7 @@ pub struct Capability {
     pub card: String,
     /// Where it is plugged in.
     pub bus: String,
-    /// What this node can do (`V4L2_CAP_…`).
+    /// Capabilities of this node (`V4L2_CAP_…`).
     pub flags: u32,
 }
 
@@ -57,7 +57,7 @@ pub struct OfferedFormat {
     pub description: String,
 }
 
-/// Image sizes from `smallest` to `largest` (width, height); one size where they are equal.
+/// Image sizes from `smallest` to `largest` (width, height); one size if they are equal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SizeRange {
     /// Smallest.
@@ -76,7 +76,7 @@ impl fmt::Display for SizeRange {
     }
 }
 
-/// Frame periods from the shortest to the longest, seconds; one where they are equal.
+/// Frame periods from the shortest to the longest, seconds; one if they are equal.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PeriodRange {
     /// Shortest.
@@ -85,7 +85,7 @@ pub struct PeriodRange {
     pub longest: Fraction,
 }
 
-/// Frames a second of a period; 0 of none.
+/// Frames per second of a period; 0 if its numerator is 0.
 pub fn rate_hz(period: Fraction) -> f64 {
     if period.numerator == 0 {
         return 0.0;
@@ -93,7 +93,7 @@ pub fn rate_hz(period: Fraction) -> f64 {
     f64::from(period.denominator) / f64::from(period.numerator)
 }
 
-/// A layout of the picture, as asked for or as granted.
+/// A layout of the picture, requested or granted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Layout {
     /// Pixel format.
@@ -115,7 +115,7 @@ pub struct ControlRange {
     pub id: u32,
     /// Its name.
     pub name: String,
-    /// What it holds (`V4L2_CTRL_TYPE_…`).
+    /// Type of its value (`V4L2_CTRL_TYPE_…`).
     pub kind: u32,
     /// Smallest value.
     pub minimum: i32,
@@ -132,9 +132,9 @@ pub struct ControlRange {
 /// A buffer that the driver has filled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Filled {
-    /// Which.
+    /// Index of the buffer.
     pub index: usize,
-    /// Bytes of it that are used, as the driver says.
+    /// Bytes of it that are used, as reported by the driver.
     pub used: usize,
     /// The driver's number of the frame.
     pub sequence: u32,
@@ -146,54 +146,54 @@ pub struct Filled {
 
 /// An open capture device.
 pub trait VideoDevice: Send {
-    /// Who it is.
+    /// Its identity.
     fn capability(&self) -> Result<Capability, Errno>;
     /// The formats that it offers.
     fn formats(&self) -> Vec<OfferedFormat>;
-    /// The sizes of a format; empty where the driver does not say.
+    /// The sizes of a format; empty if the driver does not report them.
     fn sizes(&self, code: FourCc) -> Vec<SizeRange>;
-    /// The frame periods of a format and size; empty where the driver does not say.
+    /// The frame periods of a format and size; empty if the driver does not report them.
     fn periods(&self, code: FourCc, width: u32, height: u32) -> Vec<PeriodRange>;
-    /// Asks for a format and size; what the driver grants may differ.
+    /// Requests a format and size; those that the driver grants may differ.
     fn set_layout(&mut self, code: FourCc, width: u32, height: u32) -> Result<Layout, Errno>;
     /// The frame period, and whether it can be set.
     fn period(&self) -> Result<(Fraction, bool), Errno>;
-    /// Asks for a frame period; what the driver grants may differ.
+    /// Requests a frame period; the one that the driver grants may differ.
     fn set_period(&mut self, period: Fraction) -> Result<Fraction, Errno>;
     /// Every control.
     fn controls(&self) -> Vec<ControlRange>;
     /// The names of a menu control's items.
     fn menu(&self, control: &ControlRange) -> Vec<(u32, String)>;
-    /// A control, where the device has it.
+    /// A control, if the device has it.
     fn control(&self, id: u32) -> Option<ControlRange>;
     /// Value of a control.
     fn value(&self, id: u32) -> Result<i32, Errno>;
     /// Sets a control.
     fn set_value(&mut self, id: u32, value: i32) -> Result<(), Errno>;
-    /// Makes and maps buffers; how many there are. With 0 asks only whether another program has some.
+    /// Makes and maps buffers, and returns their number. With 0 only checks whether another program has some.
     fn make_buffers(&mut self, count: u32) -> Result<usize, Errno>;
     /// Gives a buffer to the driver.
     fn enqueue(&mut self, index: usize) -> Result<(), Errno>;
-    /// Takes the oldest filled buffer; `Errno::AGAIN` where there is none.
+    /// Takes the oldest filled buffer; `Errno::AGAIN` if there is none.
     fn dequeue(&mut self) -> Result<Filled, Errno>;
-    /// Begins to stream.
+    /// Starts streaming.
     fn start(&mut self) -> Result<(), Errno>;
-    /// The whole memory of a buffer that is not the driver's; empty where it is.
+    /// The whole memory of a buffer; empty while the driver owns it.
     fn memory(&self, index: usize) -> &[u8];
-    /// Sleeps until a buffer is there, `wake` can be read, or `millis` are over. Whether a buffer, or an error, can be
-    /// fetched.
+    /// Sleeps until a buffer is filled, `wake` can be read, or `millis` have passed. Returns whether a buffer, or an
+    /// error, can be dequeued.
     fn wait(&self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<bool, Errno>;
 }
 
-/// Where devices and time come from.
+/// Source of devices and time.
 pub trait VideoSystem: Send {
-    /// What it opens.
+    /// Type of its devices.
     type Device: VideoDevice;
-    /// Opens the device of a name; also its path, for messages.
+    /// Opens the device of a name; also returns its path, for messages.
     fn open(&mut self, name: &str) -> Result<(PathBuf, Self::Device), OpenFailure>;
-    /// CLOCK_MONOTONIC.
+    /// CLOCK_MONOTONIC, nanoseconds.
     fn now_nanos(&self) -> i64;
-    /// Sleeps until `wake` can be read or `millis` are over.
+    /// Sleeps until `wake` can be read or `millis` have passed.
     fn pause(&self, wake: Option<BorrowedFd<'_>>, millis: u32);
 }
 

@@ -1,4 +1,4 @@
-//! Out and in again keeps every bit; nothing hostile gets in, and nothing panics.
+//! A round trip preserves every bit; invalid messages are refused, and nothing panics.
 
 use nalgebra::Vector6;
 use proptest::prelude::*;
@@ -102,7 +102,7 @@ fn every_state_has_its_codes() {
 }
 
 #[test]
-fn hostile_keyframes_are_refused() {
+fn invalid_keyframes_are_refused() {
     let good = keyframe();
     let with = |change: &dyn Fn(&mut Keyframe)| {
         let mut keyframe = good.clone();
@@ -128,7 +128,7 @@ fn hostile_keyframes_are_refused() {
         triangle[index] = value;
         triangle
     };
-    // Not a number, negative, correlated by more than 1, beyond all sense.
+    // NaN, a negative variance, a correlation above 1, an absurdly large variance.
     for broken in [with(5, f64::NAN), with(7, -0.01), with(1, 0.02), with(27, 1e9)] {
         let mut header = keyframe_header(&good);
         header.place_covariance = broken;
@@ -143,7 +143,7 @@ fn hostile_keyframes_are_refused() {
 }
 
 #[test]
-fn poses_of_broken_covariance_are_refused() {
+fn poses_with_an_invalid_covariance_are_refused() {
     let with = |index: usize, value: f64| {
         let mut message = pose_message(&pose(), &PoseTiming::default());
         message.map_covariance[index] = value;
@@ -157,7 +157,7 @@ fn poses_of_broken_covariance_are_refused() {
 }
 
 #[test]
-fn broken_velocities_are_refused() {
+fn invalid_velocities_are_refused() {
     let good = pose_message(&pose(), &PoseTiming::default());
     let read = |change: &dyn Fn(&mut PoseMessage)| {
         let mut message = good;
@@ -165,7 +165,7 @@ fn broken_velocities_are_refused() {
         pose_from_message(&message).map(|read| read.velocity.is_some())
     };
     assert_eq!(read(&|_| {}), Ok(true));
-    // Covariances of two axes may be negative.
+    // Covariances between two axes may be negative.
     assert_eq!(read(&|message| message.velocity_covariance[1] = -0.1), Ok(true));
     assert_eq!(read(&|message| message.has_velocity = 0), Ok(false));
     let unknown = Err(MessageError::UnknownCode { field: "has_velocity", code: 2 });
@@ -180,7 +180,7 @@ fn broken_velocities_are_refused() {
 }
 
 #[test]
-fn a_pose_without_velocity_says_so_in_zeros() {
+fn a_pose_without_velocity_has_zeros_in_its_message() {
     let without = PoseEstimate { velocity: None, ..pose() };
     let timing = PoseTiming { realtime_nanos: 1_700_000_000_123_456_789, ..PoseTiming::default() };
     let message = pose_message(&without, &timing);
@@ -192,7 +192,7 @@ fn a_pose_without_velocity_says_so_in_zeros() {
 }
 
 #[test]
-fn hostile_frames_are_refused() {
+fn invalid_frames_are_refused() {
     let pixels = vec![0; 20 * 18];
     let header = FrameHeader {
         intrinsics: [20.0, 21.0, 9.5, 8.5],

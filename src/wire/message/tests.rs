@@ -1,4 +1,4 @@
-//! Layouts that every program which reads our topics relies on.
+//! Layouts that every program reading our topics relies on.
 
 use super::*;
 

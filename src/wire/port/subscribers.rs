@@ -1,4 +1,4 @@
-//! Who subscribes to a topic that has no place left for another.
+//! Names the subscribers of a topic that has no room for another.
 
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::node::{NodeState, NodeView};
@@ -8,7 +8,7 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use crate::wire::open_error::OpenError;
 use crate::wire::port::Part;
 
-/// The error of a subscriber that came when the topic `name` had all that it may have.
+/// Returns the error of a subscriber that finds the topic `name` full.
 pub(super) fn too_many<T: Part, H: Part>(
     name: &str,
     service: &PortFactory<ipc::Service, [T], H>,
@@ -19,7 +19,7 @@ pub(super) fn too_many<T: Part, H: Part>(
         CallbackProgression::Continue
     });
     let mut nodes: Vec<(UniqueNodeId, String)> = Vec::new();
-    // Without their names the processes' ids have to do.
+    // Without names, the process ids have to suffice.
     let _ = service.nodes(|node| {
         if let NodeState::Alive(node) = node {
             let name = node.details().as_ref().map(|details| details.name().to_string());

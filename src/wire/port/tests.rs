@@ -1,4 +1,4 @@
-//! Two members of one instance in one process, and those who come late.
+//! Two members of one instance in one process, and late subscribers.
 
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
@@ -54,7 +54,7 @@ fn a_frame_is_written_in_place_and_wakes_its_reader() {
 }
 
 #[test]
-fn a_slow_reader_loses_the_oldest_and_blocks_nobody() {
+fn a_slow_reader_loses_the_oldest_messages_and_blocks_no_publisher() {
     let rig = Rig::new();
     let hub = rig.join("capture");
     let frames = hub.publisher::<u8, FrameHeader>(&FRAME, 1).unwrap();
@@ -67,7 +67,7 @@ fn a_slow_reader_loses_the_oldest_and_blocks_nobody() {
     assert_eq!(reader.newest().unwrap().unwrap().header().sequence, 99);
 }
 
-/// Of the messages it may hold a reader keeps all but one: the newest comes nevertheless.
+/// A reader that keeps all but one of the messages it may hold still receives the newest.
 #[test]
 fn a_reader_that_holds_messages_still_gets_the_newest() {
     let rig = Rig::new();
@@ -86,7 +86,7 @@ fn a_reader_that_holds_messages_still_gets_the_newest() {
     assert!(error.contains("capture/frame") && error.contains("Borrow"), "{error}");
     held.clear();
     assert_eq!(reader.newest().unwrap().unwrap().header().sequence, 100);
-    // Of keyframes there is no place for a second one beside the newest.
+    // Keyframe topics have no slot for a second message next to the newest.
     let graphs = hub.publisher::<u64, ()>(&GRAPH, 1).unwrap();
     let reader = hub.subscriber::<u64, ()>(&GRAPH).unwrap();
     for number in 0..9 {
@@ -96,7 +96,7 @@ fn a_reader_that_holds_messages_still_gets_the_newest() {
 }
 
 #[test]
-fn the_reader_that_comes_too_late_is_told_who_has_the_places() {
+fn a_reader_that_finds_the_topic_full_is_told_its_subscribers() {
     let rig = Rig::new();
     let hub = rig.join("mapper");
     let _keyframes = hub.publisher::<u64, ()>(&KEYFRAME, 1).unwrap();
@@ -122,7 +122,7 @@ fn the_reader_that_comes_too_late_is_told_who_has_the_places() {
 }
 
 #[test]
-fn an_observer_of_other_types_is_not_told_that_nothing_runs() {
+fn an_observer_with_other_types_is_not_told_that_nothing_runs() {
     let rig = Rig::new();
     let hub = rig.join("tracker");
     let _poses = hub.publisher::<PoseMessage, ()>(&POSE, 1).unwrap();
@@ -134,7 +134,7 @@ fn an_observer_of_other_types_is_not_told_that_nothing_runs() {
 }
 
 #[test]
-fn who_comes_late_gets_the_history() {
+fn a_late_subscriber_gets_the_history() {
     let rig = Rig::new();
     let hub = rig.join("tracker");
     let poses = hub.publisher::<u64, ()>(&POSE, 1).unwrap();
@@ -205,7 +205,7 @@ fn shared_memory(place: &Place) -> usize {
 }
 
 #[test]
-fn the_file_for_foreign_tools_says_the_same() {
+fn the_configuration_file_for_other_tools_matches_ours() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/config/iceoryx2.toml");
     let file = Config::from_file(&FilePath::new(path.as_bytes()).unwrap()).unwrap();
     let place = Place::new("semidense", crate::wire::folders::SYSTEM_ROOT).unwrap();

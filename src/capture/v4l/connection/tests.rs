@@ -16,7 +16,7 @@ fn camera(fake: &Fake) -> Camera<Fake> {
     camera_with(fake, CameraParams::default())
 }
 
-/// Waits until there is a frame or the camera is absent; its number, or the reason.
+/// Waits until there is a frame or the camera is absent; returns the frame's number, or the reason.
 fn look(camera: &mut Camera<Fake>) -> Result<u64, String> {
     for _ in 0..100 {
         match camera.await_frame(None, 10).unwrap() {
@@ -28,7 +28,7 @@ fn look(camera: &mut Camera<Fake>) -> Result<u64, String> {
     panic!("neither a frame nor a reason")
 }
 
-/// One more frame, taken and given back.
+/// Delivers one more frame, takes it and releases it.
 fn take(fake: &Fake, camera: &mut Camera<Fake>, sequence: u32) -> u64 {
     fake.pass(FRAME_NANOS);
     fake.give(frame(sequence, vec![7; 640 * 480]));
@@ -37,13 +37,13 @@ fn take(fake: &Fake, camera: &mut Camera<Fake>, sequence: u32) -> u64 {
     number
 }
 
-/// Lets the camera be absent until it is opened again.
+/// Waits until the absent camera is opened again.
 fn come_back(camera: &mut Camera<Fake>) {
     while matches!(camera.await_frame(None, 50).unwrap(), Arrival::Absent(_)) {}
 }
 
 #[test]
-fn frames_come_with_their_numbers_and_gaps_are_counted() {
+fn frames_arrive_with_their_numbers_and_gaps_are_counted() {
     let fake = Fake::default();
     let mut camera = camera(&fake);
     let numbers: Vec<u64> = [0, 1, 4, 5].map(|s| take(&fake, &mut camera, s)).to_vec();
@@ -68,7 +68,7 @@ fn after_a_pause_the_newest_frame_is_taken() {
 }
 
 #[test]
-fn a_frame_whose_stamp_does_not_come_after_the_last_is_left_out() {
+fn a_frame_whose_stamp_does_not_increase_is_skipped() {
     let fake = Fake::default();
     let mut camera = camera(&fake);
     take(&fake, &mut camera, 0);
@@ -79,7 +79,7 @@ fn a_frame_whose_stamp_does_not_come_after_the_last_is_left_out() {
 }
 
 #[test]
-fn damaged_frames_are_counted_and_left_out() {
+fn damaged_frames_are_counted_and_skipped() {
     let fake = Fake::default();
     let mut camera = camera(&fake);
     take(&fake, &mut camera, 0);
@@ -93,7 +93,7 @@ fn damaged_frames_are_counted_and_left_out() {
 }
 
 #[test]
-fn a_camera_that_is_not_there_is_awaited_ever_more_patiently() {
+fn a_missing_camera_is_retried_at_growing_intervals() {
     let fake = Fake::default();
     fake.refuse_opening(Some(OpenFailure::Missing));
     let mut camera = camera(&fake);
@@ -103,7 +103,7 @@ fn a_camera_that_is_not_there_is_awaited_ever_more_patiently() {
         let before = fake.now_nanos();
         let Ok(Arrival::Absent(reason)) = camera.await_frame(None, 100) else { panic!("absent") };
         assert!(reason.starts_with("there is no camera 0; plug it in"), "{reason}");
-        // A look that takes no time was an attempt.
+        // A check that takes no time was an attempt.
         if fake.now_nanos() == before {
             tries.push((before - last) / 100_000_000);
             last = before;
@@ -117,7 +117,7 @@ fn a_camera_that_is_not_there_is_awaited_ever_more_patiently() {
 }
 
 #[test]
-fn an_unplugged_camera_comes_back_and_its_numbers_go_on() {
+fn an_unplugged_camera_reconnects_and_its_numbers_continue() {
     let fake = Fake::default();
     let mut camera = camera(&fake);
     for sequence in 0..100 {
@@ -138,7 +138,7 @@ fn an_unplugged_camera_comes_back_and_its_numbers_go_on() {
 }
 
 #[test]
-fn a_healthy_life_makes_the_next_pause_short_again() {
+fn healthy_streaming_makes_the_next_pause_short_again() {
     let fake = Fake::default();
     let mut camera = camera(&fake);
     let mut pause = |frames: u32| {
@@ -175,7 +175,7 @@ fn every_failure_is_a_state_with_its_reason() {
 }
 
 #[test]
-fn a_camera_that_can_never_serve_is_an_error_until_it_has() {
+fn an_unusable_camera_is_an_error_unless_it_has_streamed() {
     let fake =
         Fake::with_formats(&[(super::super::pixel_format::PixelFormat::Grey, &[(320, 240)], 30)]);
     let error = camera(&fake).await_frame(None, 10).unwrap_err();
@@ -184,7 +184,7 @@ fn a_camera_that_can_never_serve_is_an_error_until_it_has() {
     fake.refuse_opening(Some(OpenFailure::Ambiguous(vec!["a".into(), "b".into()])));
     let error = camera(&fake).await_frame(None, 10).unwrap_err();
     assert_eq!(error, "0 may be a or b; name one of them");
-    // Plugged in again it may be another one for a moment.
+    // After reconnection it may be a different device for a moment.
     let fake = Fake::default();
     let mut served = camera(&fake);
     take(&fake, &mut served, 0);
@@ -198,7 +198,7 @@ fn a_camera_that_can_never_serve_is_an_error_until_it_has() {
 }
 
 #[test]
-fn a_camera_that_falls_silent_is_opened_again() {
+fn a_camera_that_falls_silent_is_reopened() {
     let fake = Fake::default();
     let mut camera = camera(&fake);
     take(&fake, &mut camera, 0);
@@ -215,7 +215,7 @@ fn a_camera_that_falls_silent_is_opened_again() {
 }
 
 #[test]
-fn a_buffer_that_is_refused_once_is_given_again() {
+fn a_buffer_that_is_refused_once_is_enqueued_again() {
     let fake = Fake::default();
     let mut camera = camera(&fake);
     take(&fake, &mut camera, 0);
@@ -224,7 +224,7 @@ fn a_buffer_that_is_refused_once_is_given_again() {
         take(&fake, &mut camera, sequence);
     }
     assert_eq!(fake.opened(), 1);
-    // A driver that takes none any more is closed.
+    // A driver that accepts no more buffers is closed.
     fake.refuse_enqueues(&[Errno::INVAL; 60]);
     let mut reasons = Vec::new();
     for sequence in 20..40 {
@@ -239,7 +239,7 @@ fn a_buffer_that_is_refused_once_is_given_again() {
 }
 
 #[test]
-fn exposure_goes_with_the_frames_and_moves_their_stamps() {
+fn exposure_accompanies_the_frames_and_moves_their_stamps() {
     let (auto, absolute) = (0x009a_0901, 0x009a_0902);
     let fake = Fake::default().with_control(auto, "Auto Exposure", (0, 3, 1), 3, 0).with_control(
         absolute,
@@ -267,7 +267,7 @@ fn exposure_goes_with_the_frames_and_moves_their_stamps() {
 }
 
 #[test]
-fn bytes_that_are_not_there_are_not_shown() {
+fn bytes_that_do_not_exist_are_not_shown() {
     let fake = Fake::default();
     let mut camera = camera(&fake);
     for (sequence, used, shown) in [(0, 0, 0), (1, 10, 10), (2, 11, 0), (3, usize::MAX, 0)] {
@@ -282,7 +282,7 @@ fn bytes_that_are_not_there_are_not_shown() {
 }
 
 #[test]
-fn a_driver_that_wakes_for_nothing_does_not_keep_the_processor() {
+fn a_driver_that_wakes_for_nothing_does_not_cause_a_busy_loop() {
     let fake = Fake::default();
     let mut camera = camera(&fake);
     take(&fake, &mut camera, 0);
