@@ -261,13 +261,20 @@ fn is_inside(x: f64, y: f64, camera: &Intrinsics) -> bool {
     u >= 0.0 && v >= 0.0 && u < camera.width as f64 && v < camera.height as f64
 }
 
-/// Share of a match that a hypothesis has adopted: its reduction in variance; 0 if it was not fused.
+/// Share of a match that a hypothesis has adopted; 0 if it was not fused. Fusion moves the smoothed value and the
+/// hypothesis's own towards the match by the same share, so that their difference shrinks by it. Where they are equal,
+/// the reduction in variance stands in: less than the share, since the error that all matches have remains.
 fn gain(before: &Hypothesis, after: &Hypothesis) -> f64 {
     if !after.is_some() || after.inverse_depth == before.inverse_depth {
         return 0.0;
     }
-    let kept = f64::from(after.variance) / f64::from(before.variance);
-    (1.0 - kept).clamp(0.0, 1.0)
+    let difference = before.smoothed - before.inverse_depth;
+    let kept = if difference == 0.0 {
+        after.variance / before.variance
+    } else {
+        (after.smoothed - after.inverse_depth) / difference
+    };
+    (1.0 - f64::from(kept)).clamp(0.0, 1.0)
 }
 
 /// Joint covariance of a keyframe's modes and the pose error of the current frame.

@@ -188,3 +188,29 @@ fn covariances_match_samples() {
     assert!(off < 0.03, "{predicted} {measured}");
     assert!(predicted.symmetric_eigenvalues().min() > 0.0);
 }
+
+#[test]
+fn the_adopted_share_of_a_match_is_its_weight_in_the_fusion() {
+    let before = Hypothesis {
+        inverse_depth: 0.52,
+        smoothed: 0.5,
+        variance: 4e-4,
+        validity: 9,
+        ..Hypothesis::NONE
+    };
+    // A match of longer baseline takes over, while the variance falls by a quarter alone: most of it is common.
+    let (found, weight) = (0.54, 0.9);
+    let after = Hypothesis {
+        inverse_depth: before.inverse_depth + weight * (found - before.inverse_depth),
+        smoothed: before.smoothed + weight * (found - before.smoothed),
+        variance: 3e-4,
+        ..before
+    };
+    assert!((gain(&before, &after) - f64::from(weight)).abs() < 1e-4);
+    // Without a difference to tell it by, the reduction in variance is the least that was adopted.
+    let unsmoothed =
+        |hypothesis: Hypothesis| Hypothesis { smoothed: hypothesis.inverse_depth, ..hypothesis };
+    assert!((gain(&unsmoothed(before), &unsmoothed(after)) - 0.25).abs() < 1e-6);
+    assert_eq!(gain(&before, &before), 0.0);
+    assert_eq!(gain(&before, &Hypothesis::NONE), 0.0);
+}
