@@ -1,4 +1,4 @@
-# The package installs on a plain Debian, with everything that it promises.
+# The package installs on a plain Debian, with all promised files.
 . /host/guest/lib
 rig=robot
 
@@ -18,7 +18,7 @@ expect "shell completion" "bash" test -s /usr/share/bash-completion/completions/
 cp -r /host/sim /var/lib/robot-sim
 chmod -R a+rX /var/lib/robot-sim
 cp /host/guest/robot.toml /etc/semidense/robot.toml
-# An emulated CPU on a busy machine may hold a process up for longer than a robot's watchdog allows.
+# An emulated CPU on a busy machine may delay a process for longer than a robot's watchdog allows.
 for process in capture tracker mapper; do
     mkdir -p "/etc/systemd/system/semidense-$process@.service.d"
     printf '[Service]\nWatchdogSec=%s\n' "$([ $process = mapper ] && echo 60 || echo 12)" \

@@ -1,11 +1,11 @@
-# A rig that is enabled gets ready by itself, under the scheduling that its units declare, and gives poses.
+# An enabled rig becomes ready on its own, with the scheduling declared by its units, and publishes poses.
 . /host/guest/lib
 rig=robot
 
 systemctl enable semidense@robot.target 2>&1
 systemctl start semidense@robot.target
 for process in capture tracker mapper; do
-    # Type=notify: active means that the process itself has said so.
+    # Type=notify: active means that the process itself has reported it.
     soon "$process is ready" 60 is_active "$process"
     expect "$process says what it does" "$(property "$process" StatusText)" test -n "$(property "$process" StatusText)"
 done
@@ -19,7 +19,7 @@ others=$(for task in /proc/"$tracker"/task/*; do chrt -p "${task##*/}"; done | g
 expect "only its frame loop" "$others of its $(ls /proc/"$tracker"/task | wc -l) threads are FIFO" test "$others" = 1
 expect "tracker's memory is locked" "$(grep VmLck /proc/"$tracker"/status | tr -s '\t ' ' ')" \
     sh -c "grep VmLck /proc/$tracker/status | grep -qv ' 0 kB'"
-# One look of an emulated machine may come between two reports of the tracker.
+# A single check on an emulated machine may fall between two reports of the tracker.
 for look in 1 2 3 4 5 6; do
     seen=$(status '.tracker | "\(.scheduling) \(.priority), memory locked: \(.memory_locked)"')
     case $seen in *null*) sleep 2 ;; *) break ;; esac
@@ -33,14 +33,14 @@ for process in capture tracker mapper; do
     expect "exposure of $process" "$exposure of 10" awk "BEGIN {exit !($exposure > 0 && $exposure < 2)}"
 done
 
-# The watchdog of the package, before this test made it longer for emulation.
+# The watchdog of the package, before this test extended it for emulation.
 for process in capture tracker mapper; do
     file=/usr/lib/systemd/system/semidense-$process@.service
     expect "watchdog of $process" "$(grep WatchdogSec "$file"), here $(property "$process" WatchdogUSec)" \
         test "$(property "$process" WatchdogUSec)" != 0
 done
 
-# The example of a CPU for the tracker alone.
+# The example of a dedicated CPU for the tracker.
 mkdir -p /etc/systemd/system/semidense-tracker@robot.service.d
 cp /usr/share/doc/semidense/examples/cpus.conf /etc/systemd/system/semidense-tracker@robot.service.d/
 systemctl daemon-reload
@@ -48,7 +48,7 @@ systemctl restart "$(unit tracker)"
 expect "CPUAffinity" "$(taskset -cp "$(main_pid tracker)")" sh -c "taskset -cp $(main_pid tracker) | grep -q ': 1$'"
 soon "poses after a restart by hand" 120 tracks
 
-# A second rig beside the first.
+# A second rig alongside the first.
 sed 's/:5:/:3:/' /etc/semidense/robot.toml > /etc/semidense/other.toml
 rig=other
 systemctl start semidense@other.target

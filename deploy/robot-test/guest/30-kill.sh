@@ -1,4 +1,4 @@
-# kill -9 of each service: it is started again, the others continue, poses resume.
+# kill -9 of each service: it is restarted, the others continue, poses resume.
 . /host/guest/lib
 rig=robot
 
@@ -18,7 +18,7 @@ for process in capture tracker mapper; do
     expect "the others have not noticed" "processes$others" kill -0 $others
 done
 
-# Who dies at once, again and again, is started later and later.
+# A process that repeatedly dies at once is restarted with a growing delay.
 before=$(property mapper NRestarts)
 for _ in 1 2 3 4 5 6; do
     victim=$(main_pid mapper)

@@ -1,4 +1,4 @@
-# A process that hangs (here: stopped) is killed by its watchdog and started again; order in stopping.
+# A hanging process (here: stopped) is killed by its watchdog and restarted; clean stopping.
 . /host/guest/lib
 rig=robot
 

@@ -59,19 +59,19 @@ soon "and frames flow again" 30 flows
 control inject_vidioc_streamon_error=1
 control inject_vidioc_reqbufs_error=1
 control inject_fatal_streaming_error=1
-soon "a start that fails: its reason" 30 says 'its driver refuses'
+soon "a start that fails: its reason" 30 says 'its driver refused the request'
 soon "and frames flow again, later" 60 flows
 control timestamp_source=1
 soon "stamps at the start of the exposure: frames flow" 30 flows
 control timestamp_source=0
-# In force from the next start of the stream on.
+# Takes effect from the next start of the stream.
 control wrap_timestamp=1
 control inject_fatal_streaming_error=1
 soon "stamps of another clock: its notice" 30 says 'stamped as they arrive'
 soon "and frames flow" 30 flows
 control wrap_timestamp=0
 control inject_fatal_streaming_error=1
-# Noticed within a frame; opened again up to two seconds later. What is not open cannot be unplugged.
+# Noticed within a frame; reopened up to two seconds later. A camera that is not open cannot be unplugged.
 sleep 1
 soon "stamps of our own clock again: frames flow" 30 flows
 

@@ -1,4 +1,4 @@
-# An upgrade keeps what the user has configured and restarts the rigs that run.
+# An upgrade keeps the user's configuration and restarts running rigs.
 . /host/guest/lib
 rig=robot
 
@@ -8,7 +8,7 @@ DEBIAN_FRONTEND=noninteractive apt-get install -y -o Dpkg::Options::=--force-con
     /host/semidense-next.deb 2>&1
 expect "upgraded" "version $(dpkg-query -W -f '${Version}' semidense)" \
     test "$(dpkg-query -W -f '${Version}' semidense)" = "$(dpkg-deb -f /host/semidense-next.deb Version)"
-# Changed by both sides; changed by the package alone.
+# Changed by both sides; changed only by the package.
 expect "the user's configuration stays" "$(tail -n 1 /etc/semidense/webcam.toml)" grep -q '^# mine' /etc/semidense/webcam.toml
 expect "the package's own is renewed" "$(tail -n 1 /etc/semidense/semidense.toml)" grep -q '^# next' /etc/semidense/semidense.toml
 expect "a rig of the user's stays" "robot.toml" test -s /etc/semidense/robot.toml

@@ -1,11 +1,11 @@
-# A simulated recording through the driver, from its output to its capture node: every picture arrives as it was, and the
-# trajectory is the simulator's.
+# A simulated recording through the driver, from its output to its capture node: every picture arrives unchanged, and
+# the trajectory matches the simulator's.
 . /host/guest/camera
 
-# Two pictures a second, each a thirtieth of a second of motion: as slow as emulation maps.
+# Two pictures a second, each a thirtieth of a second of motion: the pace of mapping under emulation.
 /host/camera_loop feed tum:/host/sim 2 2> /dev/null | v4l2-ctl -d "$out" --stream-out-mmap --stream-from=- > /dev/null 2>&1 &
 feeder=$!
-# One frame of five: emulation does not keep up with sixty a second.
+# One frame in five: emulation does not keep up with sixty a second.
 control percentage_of_dropped_buffers=80
 sleep 1
 $user semidense --instance "$rig" run --source "v4l:platform-vivid.0" --rig "$work/rig.toml" --output "$work/run" --json \

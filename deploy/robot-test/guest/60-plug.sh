@@ -1,5 +1,5 @@
-# A camera that has been given to a rig has a stable name and starts its rig when it is plugged in (here: the kernel's
-# virtual camera, whose module is the plug).
+# A camera assigned to a rig has a stable name and starts its rig when it is plugged in (here: the kernel's virtual
+# camera, whose module serves as the plug).
 . /host/guest/lib
 rig=plugged
 

@@ -1,4 +1,4 @@
-# A rig with a camera under systemd: ready without it, streams when it comes, and lives through what happens to it.
+# A rig with a camera under systemd: ready without it, streams once it appears, and survives its failures.
 . /host/guest/camera
 
 cp "$work/rig.toml" /etc/semidense/camera-rig.toml

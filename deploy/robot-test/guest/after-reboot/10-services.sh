@@ -1,4 +1,4 @@
-# The enabled rig has come back by itself.
+# The enabled rig has started again on its own.
 . /host/guest/lib
 rig=robot
 
