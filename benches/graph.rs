@@ -1,5 +1,5 @@
-//! What the pose graph costs: `cargo bench --bench graph`, on the public graphs where these are on the machine and on
-//! loops of keyframes as a map has them.
+//! Cost of the pose graph: `cargo bench --bench graph`, on the public graphs if they are on the machine, and on loops
+//! of keyframes like those of a map.
 
 #[path = "../tests/support/g2o.rs"]
 mod g2o;
@@ -15,7 +15,7 @@ use semidense::slam::graph::pose_graph::{Constraint, PoseGraph};
 use semidense::slam::graph::robust::RobustKernel;
 use semidense::slam::graph::{GraphParams, optimise};
 
-/// Repetitions, of which the best counts.
+/// Repetitions, of which the fastest counts.
 const REPEATS: usize = 5;
 
 fn main() {
@@ -57,8 +57,8 @@ fn measure(name: &str, graph: &PoseGraph, params: &GraphParams) {
     );
 }
 
-/// Rounds of 50 keyframes, each connected to the three before and, every fifth, to the round before; the measurements
-/// disagree a little, and scale drifts.
+/// Rounds of 50 keyframes, each connected to the previous three and, every fifth, to the previous round; the
+/// measurements are slightly inconsistent, and scale drifts.
 fn rounds(keyframes: usize) -> PoseGraph {
     let step =
         Sim3::exp(&Twist7::from([0.3, 0.0, 0.0, 0.0, std::f64::consts::TAU / 50.0, 0.0, 0.0]));

@@ -1,4 +1,4 @@
-//! What place recognition costs: `cargo bench --bench places`, on keyframes that each show another collage.
+//! Cost of place recognition: `cargo bench --bench places`, on keyframes that each show a different collage.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -6,7 +6,7 @@ use std::time::Instant;
 use semidense::slam::places::{Describer, Description, PlaceIndex};
 
 const SIZE: [usize; 2] = [640, 480];
-/// Keyframes that ask.
+/// Keyframes that are looked up.
 const QUERIES: usize = 100;
 
 fn main() {
@@ -54,7 +54,7 @@ fn query(index: &PlaceIndex, known: &[Description]) -> [f64; 2] {
     [millis[millis.len() / 2], millis[millis.len() - 1]]
 }
 
-/// Rectangles of all greys and sizes, moved by so many pixels.
+/// Rectangles of all grey levels and sizes, shifted by `moved` pixels.
 fn collage(seed: u64, moved: usize) -> Vec<u8> {
     const RECTANGLES: usize = 400;
     let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;

@@ -1,13 +1,13 @@
-//! Ground truth for a camera that is fed a recording: vivid's output, looped to its capture node.
+//! Ground truth for a camera that replays a recording: vivid's output, looped to its capture node.
 //!
 //! ```sh
 //! camera_loop feed tum:DIR HZ | v4l2-ctl -d /dev/video1 --stream-out-mmap --stream-from=-    # GREY, 640x480
 //! camera_loop watch tum:DIR TRUTH       # while `semidense run --source v4l:…` reads the capture node
 //! ```
 //!
-//! The recording has a quarter of the size; vivid's scaler copies pairs of pixels, so each is repeated
-//! four times. The node keeps the last picture that it was given, so that any pace will do. `watch` looks at every frame that capture sends, finds the picture of the recording that
-//! it is, pixel for pixel, and writes its true pose with the stamp of the camera.
+//! The recording has a quarter of the size; vivid's scaler copies pairs of pixels, so each pixel is repeated four
+//! times. The node keeps the last picture it was given, so any pace will do. `watch` reads every frame that capture
+//! sends, finds which picture it is, pixel for pixel, and writes that picture's true pose with the camera's stamp.
 
 use std::collections::HashMap;
 use std::error::Error;
@@ -26,9 +26,9 @@ use semidense::wire::place::Place;
 use semidense::wire::port::{Access, Hub, Subscriber, wait};
 use semidense::wire::topic::FRAME;
 
-/// How much larger the output's pictures are, along each side.
+/// Factor by which the output's pictures are larger, along each side.
 const SCALE: usize = 4;
-/// What the scaler copies at a time.
+/// Pixels that the scaler copies at a time.
 const PAIR: usize = 2;
 
 fn main() -> ExitCode {
@@ -62,7 +62,7 @@ fn pictures(source: &mut dyn FrameSource) -> Result<Vec<Picture>, Box<dyn Error>
     Ok(found)
 }
 
-/// A picture as the output node takes it.
+/// A picture in the size of the output node.
 fn enlarged(pixels: &[u8], width: usize) -> Vec<u8> {
     let mut large = Vec::with_capacity(SCALE * SCALE * pixels.len());
     for row in pixels.chunks(width) {
@@ -72,7 +72,7 @@ fn enlarged(pixels: &[u8], width: usize) -> Vec<u8> {
     large
 }
 
-/// Back and forth, without end: the camera never jumps.
+/// Back and forth, indefinitely: the camera never jumps.
 fn feed(source: &str, rate_hz: &str) -> Result<(), Box<dyn Error>> {
     let mut source = open(&source.parse()?, None, &SourceParams::default())?;
     let width = source.intrinsics().width;

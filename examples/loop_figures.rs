@@ -1,5 +1,5 @@
-//! Figures of the similarities measured between keyframes: every pair of a map, with and without a common view by the
-//! truth.
+//! Figures of the similarities measured between keyframes: every pair of a map, with and without a common view
+//! according to ground truth.
 //!
 //! ```text
 //! cargo run --release --example loop_figures -- tum:DIR
@@ -29,27 +29,27 @@ use semidense::slam::trajectory::StampedPose;
 struct Arguments {
     /// Source with ground truth and depth images.
     source: SourceName,
-    /// Frames read of it.
+    /// Number of frames to read.
     #[arg(long)]
     frames: Option<usize>,
-    /// Every so many keyframes is taken.
+    /// Use every n-th keyframe.
     #[arg(long, default_value_t = 1)]
     stride: usize,
-    /// Errors against the map of the run, which was estimated jointly, instead of the ground truth: where that is worse.
+    /// Compare with the map of the run, which was estimated jointly, for sources whose ground truth is worse.
     #[arg(long)]
     against_map: bool,
-    /// What the run's own search for loops came to, and no more.
+    /// Only print the outcomes of the run's own search for loops.
     #[arg(long)]
     searches: bool,
-    /// A line for each pair.
+    /// Print a line for each pair.
     #[arg(long)]
     all: bool,
-    /// Starts around the truth instead: share accepted over their error.
+    /// Start around the truth instead: share accepted over the error of the start.
     #[arg(long)]
     basin: bool,
 }
 
-/// A keyframe with its true place and unit.
+/// A keyframe with its true pose and unit.
 struct Placed {
     keyframe: Keyframe,
     world_from_keyframe: Sim3,
@@ -134,7 +134,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Length of the keyframe's unit: the median of true depth over its own.
+/// Length of the keyframe's unit: the median ratio of true depth to its own.
 fn unit_m(source: &mut dyn FrameSource, keyframe: &Keyframe) -> Option<f64> {
     let depth = source.depth_at(keyframe.capture_nanos).ok().flatten()?;
     let at = |u: u16, v: u16| depth.at(usize::from(u), usize::from(v));
@@ -151,7 +151,7 @@ fn unit_m(source: &mut dyn FrameSource, keyframe: &Keyframe) -> Option<f64> {
     Some(f64::from(ratios[ratios.len() / 2]))
 }
 
-/// Share of the points of one keyframe that the other sees, by the truth.
+/// Share of the points of one keyframe that the other sees, according to ground truth.
 fn overlap(i: &Placed, j: &Placed) -> f64 {
     let world_from_j = SE3 { ..j.world_from_keyframe.rigid };
     i.keyframe.usage(&i.world_from_keyframe.locate(&world_from_j))
@@ -178,9 +178,9 @@ fn median(mut values: Vec<f64>) -> f64 {
 }
 
 fn pairs(solver: &ConstraintSolver, placed: &[Placed], prints_all: bool) {
-    /// Classes of the smaller share in view.
+    /// Classes of the smaller of both shares in view.
     const CLASSES: [f64; 6] = [0.0, 0.05, 0.3, 0.5, 0.7, 0.85];
-    /// A measurement that errs by more is another place: metres, degrees.
+    /// Errors above which a measurement is of a different place: metres, degrees.
     const FALSE_M: f64 = 0.2;
     const FALSE_DEG: f64 = 8.0;
     let mut classes = vec![(0, 0, 0, Vec::new(), Vec::new()); CLASSES.len()];
@@ -256,7 +256,7 @@ fn pairs(solver: &ConstraintSolver, placed: &[Placed], prints_all: bool) {
     println!("ms, median and 95 %: accepted {accepted:.1?}, refused {refused:.1?}");
 }
 
-/// Starts around the truth of pairs that see at least half of each other.
+/// Starts around the truth for pairs that see at least half of each other.
 fn basin(solver: &ConstraintSolver, placed: &[Placed]) {
     let mut good = Vec::new();
     for (a, i) in placed.iter().enumerate() {

@@ -1,5 +1,5 @@
-//! What a large map costs on the disk and how long it takes to begin in it: `cargo run --release --example map_figures --
-//! MAP_DIR NUM_KEYFRAMES`. The keyframes of a map are taken over and over, until there are so many.
+//! Size of a large map on disk and time to start in it: `cargo run --release --example map_figures -- MAP_DIR
+//! NUM_KEYFRAMES`. The keyframes of a map are repeated until there are that many.
 
 use std::path::Path;
 use std::time::Instant;
@@ -13,7 +13,7 @@ use semidense::slam::map::Map;
 use semidense::slam::mapper::prior::MapUse;
 use semidense::slam::mapper::{Mapper, MapperParams};
 
-/// Times that it is loaded: the best and the worst are told.
+/// Number of loads, of which the fastest and the slowest are printed.
 const REPETITIONS: usize = 5;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -22,7 +22,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let count: usize = count.parse()?;
     let few = load(Path::new(folder), usize::MAX)?;
     let camera = few.manifest.camera;
-    // Described where they are not yet.
+    // Describes the keyframes that have no description yet.
     let mut mapper = Mapper::new(camera, MapperParams::default())?;
     mapper.begin_in(few.map, MapUse::Extend)?;
     for detail in [MapDetail::Full, MapDetail::Small] {

@@ -1,4 +1,4 @@
-//! What a wrong calibration changes in the figures that a run can see without ground truth.
+//! Effect of a wrong calibration on the figures that a run can compute without ground truth.
 //!
 //! ```text
 //! cargo run --release --example rig_figures -- DIR …      # folders with a camera.txt
@@ -19,13 +19,13 @@ struct Arguments {
     /// Folders of recordings in TUM layout, with a camera.txt.
     #[arg(required = true)]
     folders: Vec<PathBuf>,
-    /// Frames of each.
+    /// Number of frames of each.
     #[arg(long, default_value_t = 150)]
     frames: usize,
     /// Factors on the focal lengths.
     #[arg(long, value_delimiter = ',', default_values_t = [1.0, 0.5, 0.8, 0.9, 1.1, 1.25, 2.0])]
     factors: Vec<f64>,
-    /// Terms k1 that are added to the lens, with the focal lengths as they are.
+    /// Terms k1 added to the lens model, with unchanged focal lengths.
     #[arg(long, value_delimiter = ',', allow_hyphen_values = true, default_values_t = [-0.35, 0.35])]
     distortions: Vec<f64>,
 }

@@ -1,5 +1,5 @@
-//! Figures of the two-frame start: how late it is, how often it is wrong and what a step costs, from
-//! many first frames of any source.
+//! Figures of the two-frame start: its delay, how often it is wrong and the cost of a step, from many first frames of
+//! any source.
 //!
 //! ```text
 //! cargo run --release --example start_figures -- tum:DIR sim:room
@@ -22,25 +22,25 @@ use semidense::slam::two_frame::{InitState, TwoFrameInitializer, TwoFrameParams}
 /// Starts from many first frames of each source.
 #[derive(Debug, Parser)]
 struct Arguments {
-    /// Sources, as `semidense run --source` takes them.
+    /// Sources, as in `semidense run --source`.
     #[arg(required = true)]
     sources: Vec<SourceName>,
-    /// Frames read of each source.
+    /// Number of frames to read from each source.
     #[arg(long, default_value_t = 90)]
     frames: usize,
-    /// Every so many frames is a first frame.
+    /// Distance between first frames.
     #[arg(long, default_value_t = 3)]
     apart: usize,
     /// Number of first frames.
     #[arg(long, default_value_t = 10)]
     starts: usize,
-    /// Every so many frames is taken, as in a live run that skips some.
+    /// Use every n-th frame, as in a live run that skips some.
     #[arg(long, default_value_t = 1)]
     stride: usize,
-    /// Frames of the source after which a start is given up.
+    /// Number of frames of the source after which a start is abandoned.
     #[arg(long, default_value_t = 60)]
     patience: usize,
-    /// Only the sums.
+    /// Print only the totals.
     #[arg(long)]
     brief: bool,
 }
@@ -52,15 +52,15 @@ struct Frame {
     depth: Option<Image<f32>>,
 }
 
-/// What a start came to.
+/// Outcome of a start.
 struct Start {
-    /// Frames of the source from its first frame to the proof.
+    /// Number of frames of the source from its first frame to the proof.
     late: usize,
     /// Length of the translation in mean depths.
     translation: f64,
-    /// What the evidence says of errors common to all depths.
+    /// Estimated errors common to all depths, from the evidence.
     common_error: f64,
-    /// Against the ground truth.
+    /// Errors against ground truth.
     errors: StartErrors,
 }
 
@@ -148,7 +148,7 @@ fn read(source: &mut dyn FrameSource, most: usize) -> Result<Vec<Frame>, Box<dyn
     Ok(frames)
 }
 
-/// The start on every `stride`-th of the frames; the time of each step goes to `millis`.
+/// Runs the start on every `stride`-th frame; appends the time of each step to `millis`.
 fn start(
     intrinsics: Intrinsics,
     frames: &[Frame],
@@ -186,7 +186,7 @@ fn start(
     Ok(None)
 }
 
-/// A quantile; NaN of nothing.
+/// A quantile; NaN without values.
 fn quantile(values: &mut [f64], share: f64) -> f64 {
     values.sort_by(f64::total_cmp);
     let last = values.len().saturating_sub(1);

@@ -1,4 +1,4 @@
-//! Another process on the same machine, started at any time: prints every pose and keyframe.
+//! A separate process on the same machine, started at any time: prints every pose and keyframe.
 //!
 //! ```sh
 //! cargo build --release --example subscribe    # first: it takes minutes
@@ -29,12 +29,12 @@ fn main() -> ExitCode {
 }
 
 fn subscribe() -> Result<(), Box<dyn Error>> {
-    // The instance's name is the first argument; its folder is where `semidense run` puts it too.
+    // The first argument is the instance's name; its folder is the one that `semidense run` uses.
     let instance = std::env::args().nth(1).unwrap_or_else(|| "semidense".to_owned());
     let place = Place::new(&instance, "")?;
     let hub = Hub::join(&place, "subscribe", Access::Observer)?;
     let poses: Subscriber<PoseMessage, ()> = hub.subscriber(&POSE)?;
-    // The active keyframe comes at once, however late we join: it is the topic's history.
+    // A late subscriber receives the active keyframe at once, from the topic's history.
     let mut keyframes = KeyframeInbox::open(&hub)?;
     let shutdown = Shutdown::install()?;
     while !shutdown.is_requested() {
@@ -45,7 +45,7 @@ fn subscribe() -> Result<(), Box<dyn Error>> {
             println!("keyframe {id} revision {}: {points} points", keyframe.revision);
         }
         while let Some(message) = poses.receive()? {
-            // A slice of one message that lies in shared memory; checked before it is believed.
+            // A slice of one message in shared memory; validated before use.
             for pose in message.payload().iter().map(pose_from_message) {
                 let pose = pose?;
                 let [x, y, z] = pose.world_from_camera.translation.into();

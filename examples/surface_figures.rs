@@ -1,6 +1,6 @@
-//! The map as one surface: size, time, and error against the true surface where a source has depth of its own:
-//! `cargo run --release --example surface_figures -- SOURCE [--given-poses] [--resolution R] [--ply FILE] [--keep MAP]`.
-//! MAP keeps the map of the replay, so that the next call only fuses it.
+//! The map as one surface: size, time, and error against the true surface if a source has depth: `cargo run --release
+//! --example surface_figures -- SOURCE [--given-poses] [--resolution R] [--ply FILE] [--keep MAP]`. MAP stores the map
+//! of the replay, so that the next call only fuses it.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -23,7 +23,7 @@ use semidense::slam::trajectory::StampedPose;
 
 type Failure = Box<dyn std::error::Error>;
 
-/// Points that are compared with the true surface: shares are known to half a percent.
+/// Number of points compared with the true surface: shares are accurate to half a per cent.
 const COMPARED: usize = 10_000;
 
 #[derive(Default)]
@@ -76,13 +76,13 @@ fn main() -> Result<(), Failure> {
     compare(source.as_mut(), &map, &surface)
 }
 
-/// Time that all threads of this process have taken.
+/// CPU time of all threads of this process, seconds.
 fn cpu_secs() -> f64 {
     let time = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
     time.tv_sec as f64 + 1e-9 * time.tv_nsec as f64
 }
 
-/// The map of a replay, or the one that an earlier call kept.
+/// The map of a replay, or the one stored by an earlier call.
 fn map_of(source: &mut dyn FrameSource, arguments: &Arguments) -> Result<Map, Failure> {
     if let Some(path) = arguments.keep.as_deref().filter(|path| Path::exists(path)) {
         return Ok(read_map(path)?);
@@ -97,7 +97,7 @@ fn map_of(source: &mut dyn FrameSource, arguments: &Arguments) -> Result<Map, Fa
     Ok(record.map)
 }
 
-/// Errors before and after against the true surface; nothing where there is no ground truth.
+/// Prints errors before and after fusion against the true surface; nothing without ground truth.
 fn compare(
     source: &mut dyn FrameSource,
     map: &Map,
@@ -146,7 +146,7 @@ fn sample(points: &[SeenPoint], count: usize) -> Vec<SeenPoint> {
     points.iter().step_by(points.len().div_ceil(count).max(1)).copied().collect()
 }
 
-/// One point for each cell as wide as the surface's, whichever comes first by a number without order.
+/// One point for each cell as wide as the surface's: the one with the lowest pseudo-random number.
 fn one_a_cell(points: &[SeenPoint]) -> Vec<SeenPoint> {
     const SHARE: f64 = 0.005;
     const SCATTER: u64 = 0x9E37_79B9_7F4A_7C15;

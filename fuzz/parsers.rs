@@ -1,7 +1,6 @@
-//! What a fuzz target does with its bytes: everything that semidense reads from files and from shared
-//! memory, each in one function. None may panic, hang or take memory without bound; what is accepted must
-//! hold what its type promises. `tests/files/fuzz_findings.rs` runs the seeds and all that was found through the
-//! same functions.
+//! The fuzz targets: everything that semidense reads from files and from shared memory, one function each. None may
+//! panic, hang or allocate without bound; accepted input must satisfy the invariants of its type.
+//! `tests/files/fuzz_findings.rs` runs the seeds and all past findings through the same functions.
 
 use std::fs;
 use std::path::Path;
@@ -43,12 +42,12 @@ use semidense::wire::message::{
     KeyframeImageHeader, KeyframePoseMessage, PoseMessage, StepMessage,
 };
 
-/// Pixels of an image that is rectified or tracked: larger ones only take longer.
+/// Upper limit for the pixels of an image that is rectified or tracked: larger ones only take longer.
 const MAX_PIXELS: usize = 64 * 64;
-/// Width and height of the images that are decoded.
+/// Width and height of decoded images.
 pub const IMAGE_SIDE: usize = 16;
 
-/// A trajectory file: what is read is in order and finite, and comes back from its own lines.
+/// A trajectory file: accepted poses are ordered and finite, and survive a round trip through their own lines.
 pub fn trajectory(bytes: &[u8]) {
     let Ok(poses) = parse_trajectory(bytes) else { return };
     assert!(poses.windows(2).all(|pair| pair[0].pose.nanos <= pair[1].pose.nanos));
@@ -60,7 +59,7 @@ pub fn trajectory(bytes: &[u8]) {
     }
 }
 
-/// A rig: the first byte says whether as TOML, `camera.txt` or `sensor.yaml`.
+/// A rig: the first byte selects TOML, `camera.txt` or `sensor.yaml`.
 pub fn rig(bytes: &[u8]) {
     let Some((kind, rest)) = bytes.split_first() else { return };
     let Ok(text) = str::from_utf8(rest) else { return };
@@ -82,7 +81,7 @@ pub fn rig(bytes: &[u8]) {
     }
 }
 
-/// The lists of a recording: the first byte says which, the others are as they should be.
+/// The lists of a recording: the first byte selects one, the others are valid.
 pub fn lists(bytes: &[u8]) {
     let Some((kind, text)) = bytes.split_first() else { return };
     thread_local! {
@@ -121,7 +120,7 @@ pub fn lists(bytes: &[u8]) {
     });
 }
 
-/// The camera of the recording that [`lists`] makes.
+/// The camera of the recording that [`lists`] writes.
 pub const SENSOR_YAML: &str = "%YAML:1.0
 sensor_type: camera
 T_BS:
@@ -155,12 +154,12 @@ fn write_images(folder: &Path) {
     fs::create_dir_all(folder.join("mav0/state_groundtruth_estimate0")).expect("a folder");
 }
 
-/// Takes every frame of a source; its stamps rise and its poses are finite.
+/// Reads every frame of a source; its stamps increase and its poses are finite.
 fn play(source: &mut dyn FrameSource) {
     let k = source.intrinsics();
     let mut pixels = vec![0; k.width * k.height];
     let mut last = None;
-    // An image that cannot be read is left out; a list names few.
+    // Images that cannot be read are skipped; a list names few.
     for _ in 0..source.num_frames().unwrap_or(0) {
         if let Ok(Some(stamp)) = source.next_into(&mut pixels) {
             assert!(last.is_none_or(|last| stamp.capture_nanos > last));
@@ -175,7 +174,7 @@ fn play(source: &mut dyn FrameSource) {
 
 /// A bag.
 pub fn bag(bytes: &[u8]) {
-    /// Frames that are taken: a bag may hold thousands.
+    /// Upper limit for the frames read: a bag may contain thousands.
     const MOST_FRAMES: usize = 100;
     thread_local! {
         static FOLDER: tempfile::TempDir = tempfile::tempdir().expect("a temporary folder");
@@ -205,7 +204,7 @@ pub fn bag(bytes: &[u8]) {
     });
 }
 
-/// An image, as grey values and as depth.
+/// An image, decoded as grey values and as depth.
 pub fn image(bytes: &[u8]) {
     let mut gray = [0; IMAGE_SIDE * IMAGE_SIDE];
     let _ = decode_gray_into(bytes, IMAGE_SIDE, IMAGE_SIDE, &mut Vec::new(), &mut gray);
@@ -214,7 +213,7 @@ pub fn image(bytes: &[u8]) {
     }
 }
 
-/// A configuration: an even first byte and the text of a file, or an odd one and settings, one a line.
+/// A configuration: an even first byte and the text of a file, or an odd one and settings, one per line.
 pub fn configuration(bytes: &[u8]) {
     let Some((kind, rest)) = bytes.split_first() else { return };
     let Ok(text) = str::from_utf8(rest) else { return };
@@ -249,10 +248,10 @@ pub fn map(bytes: &[u8]) {
     }
 }
 
-/// A file of a map folder: an even first byte and a manifest, or an odd one and the image and depth of a keyframe.
+/// A file of a map folder: an even first byte and a manifest, or an odd one and a keyframe's image and depth.
 pub fn map_folder(bytes: &[u8]) {
     let Some((kind, rest)) = bytes.split_first() else { return };
-    // The checksums are made right: fuzzing would hardly guess them.
+    // Corrects the checksums, which fuzzing would hardly guess.
     let mut rest = rest.to_vec();
     if kind % 2 == 0 {
         if let Some(body) = rest.len().checked_sub(4) {
@@ -283,7 +282,7 @@ fn crc32(bytes: &[u8]) -> u32 {
     !bytes.iter().fold(!0, |crc, byte| (0..8).fold(crc ^ u32::from(*byte), step))
 }
 
-/// The log of a journal: what is read is a run that results can be made of.
+/// The log of a journal: an accepted log is a run whose results can be written.
 pub fn journal(bytes: &[u8]) {
     let Some(found) = Recovered::from_log(bytes) else { return };
     let folder = Path::new("/nowhere");
@@ -305,7 +304,7 @@ pub fn journal(bytes: &[u8]) {
     let _ = Config::from_text(&found.start.config, "journal");
 }
 
-/// One message of any topic: the first byte says which.
+/// One message of any topic, which the first byte selects.
 pub fn message(bytes: &[u8]) {
     let Some((kind, mut rest)) = bytes.split_first() else { return };
     match kind % 7 {
@@ -314,7 +313,7 @@ pub fn message(bytes: &[u8]) {
             let mut order = FrameOrder::default();
             order.arrive(&header);
             let _ = frame_from_message(&header, rest);
-            // A second header: the two must not be more than the arithmetic bears.
+            // A second header: no pair may overflow the arithmetic.
             if let Some(next) = take::<FrameHeader>(&mut rest) {
                 order.arrive(&next);
                 assert!(order.period_nanos() > 0);
@@ -382,18 +381,18 @@ pub fn message(bytes: &[u8]) {
     }
 }
 
-/// What comes over the wire, in any order, through tracker and mapper: each message is a byte for its kind
-/// and the message, the pictures are made here.
+/// Messages from the wire, in any order, through tracker and mapper: each is a byte for its kind and the message; the
+/// images are generated here.
 pub fn pipeline(bytes: &[u8]) {
     let mut rest = bytes;
     let mut tracker: Option<(Intrinsics, Tracker)> = None;
     let mut mapper: Option<(Intrinsics, Mapper)> = None;
-    // A step of the map at most takes a millisecond.
+    // The longest operation, a step of the map, takes a millisecond.
     for _ in 0..12 {
         let Some((kind, after)) = rest.split_first() else { return };
         rest = after;
         match kind % 4 {
-            // A frame, tracked; and with the pose that came of it, mapped.
+            // A frame, tracked, then mapped with the resulting pose.
             0 => {
                 let Some(view) = take_view(&mut rest, *kind) else { continue };
                 let (of, tracker) =
@@ -407,7 +406,7 @@ pub fn pipeline(bytes: &[u8]) {
                     map_step(&mut mapper, &view, &pose);
                 }
             }
-            // A frame with a pose from the wire, mapped.
+            // A frame, mapped with a pose from the wire.
             1 => {
                 let Some(view) = take_view(&mut rest, *kind) else { continue };
                 let Some(message) = take::<PoseMessage>(&mut rest) else { continue };
@@ -442,7 +441,7 @@ pub fn pipeline(bytes: &[u8]) {
                     tracker.adopt(Box::new(reference));
                 }
             }
-            // The mapper's own keyframe to the tracker.
+            // The mapper's own keyframe, passed to the tracker.
             _ => {
                 let keyframe = mapper.as_ref().and_then(|(_, mapper)| mapper.keyframe());
                 if let (Some(keyframe), Some((_, tracker))) = (keyframe, tracker.as_mut()) {
@@ -465,7 +464,7 @@ fn map_step(
     pose: &semidense::slam::pose::PoseEstimate,
 ) {
     if mapper.as_ref().is_none_or(|(of, _)| *of != view.intrinsics) {
-        // Too small an image is refused, as in the mapper's shell.
+        // An image that is too small is refused, as in the mapper process.
         let Ok(mut fresh) = Mapper::new(view.intrinsics, MapperParams::default()) else { return };
         if let Some((_, before)) = mapper.take() {
             fresh.succeed(before);
@@ -477,7 +476,7 @@ fn map_step(
     }
 }
 
-/// A frame with a picture of its own.
+/// A frame with its own image.
 struct View {
     sequence: u64,
     capture_nanos: i64,
@@ -506,7 +505,7 @@ fn take_view(rest: &mut &[u8], shift: u8) -> Option<View> {
     Some(View::new(frame.sequence, frame.capture_nanos, intrinsics, shift / 4))
 }
 
-/// Waves, `shift` tenths of a pixel to the right.
+/// Waves, shifted by `shift` tenths of a pixel to the right.
 fn picture(width: usize, height: usize, shift: u8) -> Vec<u8> {
     let grey = |i: usize| {
         let (u, v) = ((i % width) as f64 - f64::from(shift) * 0.1, (i / width) as f64);
@@ -515,7 +514,7 @@ fn picture(width: usize, height: usize, shift: u8) -> Vec<u8> {
     (0..width * height).map(|i| grey(i) as u8).collect()
 }
 
-/// A message from the front of `bytes`.
+/// Takes a message from the front of `bytes`.
 fn take<T: Copy + plain::Message>(bytes: &mut &[u8]) -> Option<T> {
     let (front, rest) = bytes.split_at_checked(size_of::<T>())?;
     *bytes = rest;
@@ -523,14 +522,14 @@ fn take<T: Copy + plain::Message>(bytes: &mut &[u8]) -> Option<T> {
     Some(unsafe { front.as_ptr().cast::<T>().read_unaligned() })
 }
 
-/// What lies in shared memory as it is.
+/// Types that can be read from shared memory unchanged.
 pub mod plain {
     use super::*;
 
     /// Messages: `#[repr(C)]`, scalars only, every bit pattern valid.
     ///
     /// # Safety
-    /// Implement it for nothing else.
+    /// Implement it for no other type.
     pub unsafe trait Message {}
 
     macro_rules! messages {

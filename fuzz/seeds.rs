@@ -1,4 +1,4 @@
-//! Small good inputs, from which fuzzing starts: made here, so that none is a file of somebody's.
+//! Small valid inputs from which fuzzing starts: generated here, so that no third-party files are included.
 
 use std::sync::Arc;
 
@@ -29,7 +29,7 @@ use super::test_bag::{TestBag, camera_info, compressed_image, frame_record, imag
 use super::test_images::{flat_block_jpeg, png_of};
 use crate::parsers::{IMAGE_SIDE, SENSOR_YAML, plain};
 
-/// A good input of a target.
+/// A valid input for a target.
 #[derive(Debug, Clone)]
 pub struct Seed {
     /// The target's name.
@@ -38,7 +38,7 @@ pub struct Seed {
     pub bytes: Vec<u8>,
 }
 
-/// A bag of ours: a camera, an image of each kind, chunks as they are.
+/// A bag of our own: a camera, an image of each kind, uncompressed chunks.
 fn bag() -> Vec<u8> {
     const SIDE: u32 = IMAGE_SIDE as u32;
     let mut bag = TestBag::default();
@@ -57,7 +57,7 @@ fn bag() -> Vec<u8> {
 
 const CAMERA: Intrinsics = Intrinsics::pinhole(40, 32, 25.0);
 
-/// At least one seed of each target, and one for each kind that its first byte can name.
+/// At least one seed for each target, and one for each kind that its first byte can select.
 pub fn seeds() -> Vec<Seed> {
     let mut seeds = Vec::new();
     let mut add = |target, bytes: Vec<u8>| seeds.push(Seed { target, bytes });
@@ -232,7 +232,7 @@ fn pose(sequence: u64) -> PoseEstimate {
     PoseEstimate { state: TrackingState::Tracking, keyframe_id: 0, ..PoseEstimate::unknown(&frame) }
 }
 
-/// One message of each kind of `parsers::message`, in its order.
+/// One message of each kind of `parsers::message`, in that order.
 fn messages() -> [Vec<u8>; 7] {
     let (keyframe, timing) = (keyframe(), PoseTiming::default());
     let pixels = vec![9; CAMERA.width * CAMERA.height];
@@ -298,7 +298,7 @@ fn messages() -> [Vec<u8>; 7] {
     ]
 }
 
-/// Frames, a keyframe from the wire, frames on it, and a pose from the wire.
+/// Frames, a keyframe from the wire, frames tracked on it, and a pose from the wire.
 fn pipeline() -> Vec<u8> {
     let frame =
         |sequence: u64| [vec![4 * sequence as u8], bytes_of(&frame_header(sequence))].concat();
@@ -316,7 +316,7 @@ fn pipeline() -> Vec<u8> {
     bytes
 }
 
-/// A message as it lies in shared memory.
+/// The bytes of a message as in shared memory.
 fn bytes_of<T: Copy + plain::Message>(message: &T) -> Vec<u8> {
     // SAFETY: a message has no padding, so that all its bytes are initialised.
     unsafe { std::slice::from_raw_parts(std::ptr::from_ref(message).cast::<u8>(), size_of::<T>()) }

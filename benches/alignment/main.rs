@@ -1,9 +1,8 @@
-//! Time of the alignment: `cargo bench --bench alignment`.
+//! Duration of the alignment: `cargo bench --bench alignment`.
 //!
-//! First two tables: the loop over points by level and kernel against what the machine can do at
-//! most, and the times of a frame's parts with their percentiles. Then criterion, which compares
-//! with the run before; its throughput is in points, so that the inverse is the time per point and
-//! iteration. A filter on the command line leaves the tables out.
+//! First two tables: the loop over points by level and kernel compared with the machine's peak, and the durations of a
+//! frame's parts with their percentiles. Then criterion, which compares with the previous run; its throughput is in
+//! points, so that the inverse is the time per point and iteration. A filter on the command line skips the tables.
 
 mod roofline;
 mod scene;
@@ -98,7 +97,7 @@ criterion_group!(benches, normal_equations, whole_frame);
 
 fn main() {
     let mut arguments = std::env::args().skip(1);
-    // Cargo itself passes --bench; a filter, or --test, wants something else.
+    // Cargo itself passes --bench; a filter, or --test, needs no tables.
     if arguments.all(|argument| argument == "--bench") {
         tables::print();
     }

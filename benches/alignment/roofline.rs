@@ -1,18 +1,18 @@
-//! What this machine can do at most: arithmetic in registers, and reading memory in order.
+//! The machine's peak: arithmetic in registers, and sequential reads of memory.
 
 use std::hint::black_box;
 use std::time::Instant;
 
 use semidense::slam::kernel::Kernel;
 
-/// Independent chains of sums: two pipes with a latency of four cycles fused, six not, want up to
-/// twelve, and with two operands fourteen registers of the sixteen that AVX2 has are taken.
+/// Independent chains of sums: two pipes with a latency of four cycles when fused, six when not, need up to twelve;
+/// with two operands, that takes fourteen of AVX2's sixteen registers.
 const CHAINS: usize = 12;
 
-/// Steps of each chain in one measurement, some tenths of a millisecond.
+/// Steps of each chain in one measurement, which takes some tenths of a millisecond.
 const STEPS: usize = 100_000;
 
-/// Measurements of which the best counts: a limit is what is reached undisturbed.
+/// Measurements, of which the fastest counts: a limit is what is reached without disturbance.
 const REPEATS: usize = 60;
 
 /// Floating-point operations of a multiply-add.
@@ -21,7 +21,7 @@ const FLOPS_PER_STEP: f64 = 2.0;
 /// Bytes read in one measurement of the memory, whatever the working set.
 const BYTES_READ: usize = 16 << 20;
 
-/// Defines a function that runs the chains: `$splat` makes a vector, `$step` is one step of a chain.
+/// Defines a function that runs the chains: `$splat` creates a vector, `$step` is one step of a chain.
 macro_rules! chains {
     ($(#[$feature:meta])* $name:ident, $splat:expr, $step:expr) => {
         $(#[$feature])*
@@ -67,13 +67,13 @@ mod instructions {
         unsafe { portable() }
     }
 
-    /// The CPU has AVX2 and FMA: there is a kernel of them.
+    /// Runs the chains with AVX2 and FMA; called only if there is a kernel for them.
     pub fn run_avx2() {
         // SAFETY: called for that kernel only.
         unsafe { avx2() }
     }
 
-    /// The CPU has AVX-512F: there is a kernel of it.
+    /// Runs the chains with AVX-512F; called only if there is a kernel for it.
     pub fn run_avx512() {
         // SAFETY: called for that kernel only.
         unsafe { avx512() }
@@ -109,7 +109,7 @@ mod instructions {
     }
 }
 
-/// Floating-point operations a nanosecond (GFLOP/s) with the instructions of `kernel`.
+/// Floating-point operations per nanosecond (GFLOP/s) with the instructions of `kernel`.
 pub fn peak_gflops(kernel: Kernel) -> f64 {
     let (run, width): (fn(), usize) = match kernel {
         Kernel::Portable => (instructions::run_portable, 4),
@@ -123,7 +123,7 @@ pub fn peak_gflops(kernel: Kernel) -> f64 {
     (CHAINS * STEPS * width) as f64 * FLOPS_PER_STEP / best_nanos(run)
 }
 
-/// Bytes a nanosecond (GB/s) of reading `bytes` in order, again and again.
+/// Bytes per nanosecond (GB/s) of reading `bytes` sequentially, over and over.
 pub fn bandwidth(bytes: usize) -> f64 {
     let words = vec![1u64; (bytes / 8).next_multiple_of(64)];
     let rounds = (BYTES_READ / (8 * words.len())).max(1);
@@ -135,7 +135,7 @@ pub fn bandwidth(bytes: usize) -> f64 {
     (rounds * words.len() * 8) as f64 / nanos
 }
 
-/// Reads all words: sixteen sums, so that no addition waits for another.
+/// Reads all words with sixteen sums, so that no addition waits for another.
 fn read(words: &[u64]) -> u64 {
     let mut sums = [0u64; 16];
     for chunk in words.as_chunks::<16>().0 {
@@ -146,7 +146,7 @@ fn read(words: &[u64]) -> u64 {
     sums.iter().fold(0, |all, sum| all.wrapping_add(*sum))
 }
 
-/// Shortest of some runs, nanoseconds.
+/// Shortest of several runs, nanoseconds.
 pub fn best_nanos(mut run: impl FnMut()) -> f64 {
     let mut best = f64::INFINITY;
     for _ in 0..REPEATS {

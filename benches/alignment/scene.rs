@@ -1,15 +1,14 @@
-//! What is aligned: waves of every length, and a keyframe of them.
+//! The input of the alignment: waves of every length, and a keyframe that shows them.
 
 use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
 
-/// The sizes that cameras have: VGA, EuRoC, HD.
+/// Common camera sizes: VGA, EuRoC, HD.
 pub const SIZES: [(usize, usize); 3] = [(640, 480), (752, 480), (1280, 720)];
 
-/// Depth is at every fifth pixel, 61 000 at 640×480, or at fewer where that is too many for one
-/// keyframe.
+/// Every fifth pixel has depth, 61 000 at 640×480, or fewer where that exceeds the capacity of a keyframe.
 const PIXELS_PER_POINT: usize = 5;
 
 pub fn camera((width, height): (usize, usize)) -> Intrinsics {

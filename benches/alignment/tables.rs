@@ -1,4 +1,4 @@
-//! The tables that the bench prints: the loop over points against the machine, times of a frame.
+//! The printed tables: the loop over points compared with the machine's peak, durations of a frame's parts.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -19,27 +19,27 @@ use semidense::slam::tracker::{Tracker, TrackerParams};
 use crate::roofline::{bandwidth, best_nanos, peak_gflops};
 use crate::scene::{SIZES, camera, frame, image, keyframe};
 
-/// Operations that whiten a point, as `accumulate_kernel::whiten` has them, a fused multiply-add
-/// counted twice, comparisons, choices and conversions not at all: two warps 47, the sample 12,
-/// residual 3, gradient 27, variance and weight 19, sums 5, the nine columns 23.
+/// Operations to whiten a point, as in `accumulate_kernel::whiten`, with a fused multiply-add counted twice, and
+/// comparisons, selections and conversions not at all: two warps 47, the sample 12, residual 3, gradient 27, variance
+/// and weight 19, sums 5, the nine columns 23.
 const WHITEN_FLOPS: f64 = 136.0;
 
-/// The products of the columns: 36 of the information, 8 of the gradient, each a multiply-add.
+/// The products of the columns: 36 for the information, 8 for the gradient, each a multiply-add.
 const PRODUCT_FLOPS: f64 = 88.0;
 
-/// Bytes that a point brings from memory: its eight floats, read once and in order …
+/// Bytes that a point loads from memory: its eight floats, read once and in order …
 const POINT_BYTES: f64 = (size_of::<PointBlock>() / LANES) as f64;
 
 /// … and four pixels of 16 bits around its projection. The columns stay in the first-level cache.
 const PIXEL_BYTES: f64 = 8.0;
 
-/// Frames of a table of times: the 99th of 100 is then the 20th longest.
+/// Frames in a table of durations: the 99th percentile is then the 20th longest.
 const FRAMES: usize = 2000;
 
-/// Keyframes of a table of times.
+/// Keyframes in a table of durations.
 const KEYFRAMES: usize = 500;
 
-/// Frames before the first that counts: caches and branch predictors are warm then.
+/// Frames before the first one that counts, to warm up caches and branch predictors.
 const WARM_UP: usize = 50;
 
 /// A scene with everything that a frame needs.
@@ -82,7 +82,7 @@ pub fn print() {
     print_times();
 }
 
-/// The loop over points on each level against what the machine can do at most.
+/// The loop over points on each level compared with the machine's peak.
 fn print_roofline() {
     let stage = Stage::new(SIZES[0], 0);
     println!(
@@ -119,7 +119,7 @@ fn print_roofline() {
     }
 }
 
-/// Times of the parts of a frame and of a whole one.
+/// Durations of the parts of a frame and of a whole one.
 fn print_times() {
     println!(
         "Times in milliseconds, fastest kernel, default parameters; the least is the one that"
@@ -155,7 +155,7 @@ fn print_times() {
     println!();
 }
 
-/// Milliseconds of each of `count` runs after the warm-up, ascending.
+/// Durations of `count` runs after the warm-up, milliseconds, ascending.
 fn times(count: usize, mut run: impl FnMut(usize)) -> Vec<f64> {
     let mut times = Vec::with_capacity(count);
     for i in 0..WARM_UP + count {

@@ -1,5 +1,5 @@
-//! What a new keyframe costs, stage by stage and as a whole, on one and on two threads:
-//! `cargo bench --bench keyframe`, with a word for the stages that are named so.
+//! Cost of a new keyframe, by stage and in total, on one and on two threads: `cargo bench --bench keyframe`, with a
+//! word to select the stages whose names contain it.
 
 use std::time::Instant;
 
@@ -24,14 +24,14 @@ use semidense::slam::pose::{Brightness, PoseEstimate, TrackingState};
 
 /// The frame of the first keyframe, in the middle of the path through the room.
 const FIRST: usize = 120;
-/// Frames from a keyframe to the next.
+/// Frames from one keyframe to the next.
 const INTERVAL: usize = 10;
-/// Frames in all.
+/// Total number of frames.
 const FRAMES: usize = 61;
 /// Repetitions of a stage.
 const REPEATS: usize = 21;
 
-/// A piece of a simulated sequence.
+/// A section of a simulated sequence.
 struct Sequence {
     simulator: Simulator,
     frames: Vec<Vec<u8>>,
@@ -69,7 +69,7 @@ fn main() {
     whole(&sequence, &pools);
 }
 
-/// Times one stage in every pool; `prepare` is not counted.
+/// Times one stage in every pool; `prepare` is not included.
 fn row<T>(
     name: &str,
     pools: &[rayon::ThreadPool],
@@ -103,14 +103,13 @@ fn row<T>(
     println!();
 }
 
-/// What this thread has used of a processor, ms: unlike the time that passes, it does not grow with what
-/// else the machine has to do.
+/// CPU time of this thread, ms: unlike wall time, it does not grow with the load of the machine.
 fn processor_ms() -> f64 {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     time.tv_sec as f64 * 1e3 + time.tv_nsec as f64 * 1e-6
 }
 
-/// The least and the median.
+/// The minimum and the median.
 fn spread(times: Vec<f64>) -> String {
     let least = times.iter().copied().fold(f64::INFINITY, f64::min);
     format!("{least:.2} / {:.2}", median(times))
@@ -238,7 +237,7 @@ fn tracked_covariance() -> [f64; 21] {
     })
 }
 
-/// The mapper's step by its place after a change of the keyframe.
+/// The mapper's step by its position after a change of keyframe.
 fn whole(sequence: &Sequence, pools: &[rayon::ThreadPool]) {
     let camera = sequence.simulator.intrinsics();
     let mut by_place: [Vec<Vec<f64>>; 2] = [0, 1].map(|_| vec![Vec::new(); INTERVAL]);

@@ -1,10 +1,10 @@
-//! What the joint estimation costs: `cargo bench --bench window`.
+//! Cost of the joint estimation: `cargo bench --bench window`.
 //!
 //! First one comparison of a pattern with its derivatives, by kernel; then an estimate of the newest keyframes after
-//! each new one of a walk through the simulated room, with the frames since the one before, on one core, against the
-//! number of keyframes that there are: 100, or a number that is given. The plot of the documentation is made by
-//! `cargo bench --bench window -- 1000 --without-frames --plot docs/window-cost.svg`: most of the time of a long walk is
-//! the simulator's, which renders the frames between keyframes.
+//! each new one of a walk through the simulated room, with the frames since the previous one, on one core, against the
+//! number of keyframes: 100, or the number given. The plot of the documentation is made by `cargo bench --bench window
+//! -- 1000 --without-frames --plot docs/window-cost.svg`: a long walk spends most of its time in the simulator, which
+//! renders the frames between keyframes.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -30,15 +30,15 @@ use semidense::slam::window::frames::TrackedFrame;
 use semidense::slam::window::params::WindowParams;
 use semidense::slam::window::{Adjustment, Window};
 
-/// Frames from a keyframe to the next.
+/// Frames from one keyframe to the next.
 const INTERVAL: usize = 12;
 /// Keyframes, unless a number is given.
 const KEYFRAMES: usize = 100;
-/// Patterns of a kernel's measurement: the points of a keyframe in seven others.
+/// Patterns in the measurement of a kernel: the points of a keyframe in seven others.
 const PATTERNS: usize = 2_100;
-/// Repetitions of it.
+/// Repetitions of that measurement.
 const REPEATS: usize = 200;
-/// Smallest difference of neighbours of a pixel that gets depth, grey levels.
+/// Minimum difference to a neighbour for a pixel to get depth, grey levels.
 const MIN_STEP: i32 = 8;
 
 fn main() {
@@ -58,14 +58,14 @@ fn main() {
     }
 }
 
-/// Nanoseconds of a comparison, by kernel.
+/// Duration of a comparison by kernel, nanoseconds.
 fn comparisons(camera: &Intrinsics, pixels: &[u8]) {
     let image = SharedImage::try_from_pixels(camera.width, camera.height, pixels.into())
         .expect("a frame has the camera's pixels");
     let observer_from_host = SE3 { translation: [0.05, 0.01, 0.0].into(), ..SE3::identity() };
     let wanted = Wanted { poses: true, depths: true, host: true };
     let pair = Pair::new(&observer_from_host, camera, wanted);
-    // All count: the derivatives are made for each.
+    // No pattern is an outlier: derivatives are computed for each.
     let robustness = Robustness { huber_grey: 9.0, most_energy: f32::INFINITY };
     let look = Look { shape: [1.0; SAMPLES], weight: [0.5; SAMPLES] };
     let mut patterns = vec![Patterns::NONE; PATTERNS.div_ceil(LANES)];
@@ -95,19 +95,19 @@ fn comparisons(camera: &Intrinsics, pixels: &[u8]) {
     }
 }
 
-/// What a new keyframe costs.
+/// Cost of a new keyframe.
 struct Cost {
-    /// Keyframes that there are then.
+    /// Number of keyframes at that time.
     keyframes: usize,
     free: usize,
     fixed: usize,
     comparisons: usize,
-    /// Copy of what is new in the map, the estimate with the frames that are aligned again, if any, and what it makes of
+    /// Copying the changes of the map, the estimate with the frames that are aligned again, if any, and applying it to
     /// the map: CPU time of one core, seconds.
     snapshot: f64,
     estimate: f64,
     correction: f64,
-    /// What the process holds beside the map's images and depth, bytes.
+    /// Memory of the process in excess of the map's images and depth, bytes.
     memory: f64,
 }
 
@@ -173,7 +173,7 @@ fn walk(
     costs
 }
 
-/// Medians of the keyframes from one row to the next.
+/// Prints medians over the keyframes from one row to the next.
 fn table(costs: &[Cost]) {
     println!("\nafter each new keyframe, medians from row to row; ms of one core");
     println!(
@@ -213,7 +213,7 @@ fn table(costs: &[Cost]) {
     }
 }
 
-/// Every keyframe's costs as dots, and their medians.
+/// Plots every keyframe's costs as dots, and their medians.
 fn plot(costs: &[Cost], path: &str) -> std::io::Result<()> {
     let chart = |title, value: fn(&Cost) -> f64| {
         let points: Vec<[f64; 2]> =
@@ -248,7 +248,7 @@ fn plot(costs: &[Cost], path: &str) -> std::io::Result<()> {
     std::fs::write(path, svg_file(&charts, 2))
 }
 
-/// The value that this share of the others is below; 0 of none.
+/// The quantile `share` of the values; 0 without values.
 fn share_of(values: impl Iterator<Item = f64>, share: f64) -> f64 {
     let mut values: Vec<f64> = values.collect();
     values.sort_by(f64::total_cmp);
@@ -256,9 +256,9 @@ fn share_of(values: impl Iterator<Item = f64>, share: f64) -> f64 {
     values.get(place).copied().unwrap_or(0.0)
 }
 
-/// Bytes of memory that the process holds.
+/// Resident memory of the process, bytes.
 fn resident_bytes() -> f64 {
-    /// Bytes of a page.
+    /// Size of a page, bytes.
     const PAGE: f64 = 4096.0;
     let text = std::fs::read_to_string("/proc/self/statm").unwrap_or_default();
     let pages = text.split_whitespace().nth(1).and_then(|pages| pages.parse::<f64>().ok());
@@ -273,7 +273,7 @@ fn map_bytes(map: &Map) -> f64 {
     map.keyframes.iter().map(bytes).sum::<usize>() as f64
 }
 
-/// A keyframe at its true place, with exact depth where there is gradient.
+/// A keyframe at its true pose, with exact depth where there is gradient.
 fn keyframe(
     simulator: &mut Simulator,
     camera: &Intrinsics,

@@ -1,4 +1,4 @@
-//! Relative pose error, normalised errors and times over one source.
+//! Relative pose error, normalised errors and times for one source.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -12,31 +12,31 @@ use semidense::slam::tracker::TrackerParams;
 
 use crate::sequence::{KeyframeChoice, Recorded, TrackedFrame, track};
 
-/// What to track and how.
+/// What to track, and how.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
     /// `tum:DIR` or `sim` (`sim:SEED` for another seed)
     source: String,
-    /// Standard deviation of the noise put on the inverse depth, share of it
+    /// Standard deviation of the noise added to the inverse depth, as a share of it
     #[arg(long, default_value_t = 0.05)]
     depth_noise: f64,
-    /// Each point's noise is this to a power of -1 to 1 times that; 1 for all the same
+    /// Multiply each point's noise by this to a power of -1 to 1; 1 for uniform noise
     #[arg(long, default_value_t = 1.0)]
     noise_spread: f64,
-    /// Smallest gradient of a keyframe's points, grey levels a pixel
+    /// Minimum gradient of a keyframe's points, grey levels per pixel
     #[arg(long, default_value_t = 5.0)]
     min_gradient: f64,
-    /// A new keyframe every so many frames; 0 where the tracker proposes one
+    /// Start a new keyframe every N frames; 0 to start one when the tracker proposes it
     #[arg(long, default_value_t = 0)]
     keyframe_every: usize,
-    /// Stop after as many frames
+    /// Stop after this many frames
     #[arg(long, default_value_t = usize::MAX)]
     frames: usize,
-    /// Tracker parameters as TOML (the tables of `[tracker]`), read over the defaults
+    /// Tracker parameters as TOML (the tables of `[tracker]`), applied over the defaults
     #[arg(long)]
     params: Option<PathBuf>,
-    /// The same in the command line, e.g. `alignment.huber=2.0;reference.finest_level=0`; each
-    /// one given is a run of its own
+    /// The same on the command line, e.g. `alignment.huber=2.0;reference.finest_level=0`; each occurrence is a
+    /// separate run
     #[arg(long)]
     set: Vec<String>,
 }
@@ -142,7 +142,7 @@ fn print_figures(frames: &[TrackedFrame]) {
         quantile(&to_keyframe_mm, 0.5),
         quantile(&to_keyframe_deg, 0.5),
     );
-    // How much of the true translation is found: noise in the depth pulls it towards zero.
+    // How much of the true translation is recovered: noise in the depth biases it towards zero.
     let (mut along, mut squared) = (0.0, 0.0);
     for frame in &tracked {
         let current_from_keyframe = frame.estimate.keyframe_from_camera.inverse();

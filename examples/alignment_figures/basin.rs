@@ -1,9 +1,8 @@
-//! Share of random starts that converge, by their distance from the truth, with and without the
-//! variance of the depth in the weights.
+//! Share of random starts that converge, by their distance from the truth, with and without the depth variance in the
+//! weights.
 //!
-//! Pairs of a simulated keyframe and a later frame; the start is the true pose, moved by a random
-//! translation or turned about a random axis so far that the keyframe's points lie, in the mean, as many
-//! pixels off as the table says.
+//! Pairs of a simulated keyframe and a later frame; the start is the true pose, translated or rotated about a random
+//! axis until the keyframe's points are displaced, on average, by the number of pixels in the table.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -23,20 +22,20 @@ use semidense::slam::pose::Brightness;
 
 use crate::sequence::{KeyframeChoice, Noise, Recorded};
 
-/// What to start from.
+/// Parameters of the starts.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
-    /// Standard deviation of the noise put on the inverse depth, share of it: the middle
+    /// Standard deviation of the noise added to the inverse depth, as a share of it: the middle
     #[arg(long, default_value_t = 0.07)]
     depth_noise: f64,
-    /// Each point's noise is this to a power of -1 to 1 times that: 1 % to 49 %, as in a map that
-    /// has seen its points for different times
+    /// Multiply each point's noise by this to a power of -1 to 1: 1 % to 49 %, as in a map whose points were observed
+    /// for different times
     #[arg(long, default_value_t = 7.0)]
     noise_spread: f64,
-    /// Frames from a keyframe to the frame that is aligned, at 10 Hz
+    /// Number of frames from a keyframe to the aligned frame, at 10 Hz
     #[arg(long, default_value_t = 4)]
     interval: usize,
-    /// Random starts of each size for each pair
+    /// Number of random starts of each size for each pair
     #[arg(long, default_value_t = 24)]
     starts: usize,
     /// Write the figure as SVG
@@ -49,23 +48,23 @@ const SCENES: [(SceneKind, u64, [&str; 2]); 2] = [
     (SceneKind::Plane, 42, ["Plane: start moved", "Plane: start turned"]),
 ];
 
-/// Mean distance of a start from the truth, pixels of 640.
+/// Mean distance of a start from the truth, pixels at a width of 640.
 const SIZES_PX: [f64; 10] = [4.0, 8.0, 16.0, 24.0, 32.0, 48.0, 64.0, 80.0, 96.0, 128.0];
 
-/// What of the start is wrong.
+/// Perturbation of the start.
 const KINDS: [&str; 2] = ["translation", "rotation"];
 
-/// A start has converged when the points lie nearer to where the true pose puts them, pixels.
+/// A start has converged if the points are closer than this to their true projections, pixels.
 const CONVERGED_PX: f64 = 1.0;
 
-/// Frames from one pair to the next.
+/// Number of frames from one pair to the next.
 const PAIR_INTERVAL: usize = 8;
 const PAIRS: usize = 6;
 
-/// Every so many points are enough for a mean.
+/// Use every n-th point, which is enough for a mean.
 const POINT_STRIDE: usize = 8;
 
-/// Ends of the starts of one size: their distances from the truth, pixels.
+/// Final distances from the truth of the starts of one size, pixels.
 type Ends = Vec<f64>;
 
 /// One pair to align.
@@ -138,7 +137,7 @@ impl Pair {
         mean_displacement_px(&self.reference, pose, &self.true_pose, POINT_STRIDE)
     }
 
-    /// The true pose, moved or turned in a random direction until it is `size_px` off.
+    /// The true pose, moved or rotated in a random direction by `size_px`.
     fn start(&self, kind: usize, size_px: f64, noise: &mut Noise) -> SE3 {
         let direction = Vector3::from_fn(|_, _| noise.normal()).normalize();
         let mut twist = Vector6::zeros();
@@ -147,7 +146,7 @@ impl Pair {
         let (mut low, mut high) = (0.0, 3.0);
         for _ in 0..40 {
             let middle = 0.5 * (low + high);
-            // Points behind the camera are as far as can be.
+            // Points behind the camera count as infinitely far.
             match self.distance_px(&moved(middle)) < size_px {
                 true => low = middle,
                 false => high = middle,
@@ -164,7 +163,7 @@ impl Pair {
     }
 }
 
-/// Where the starts of one size end, with and without depth variance: the same starts.
+/// Final distances for one size, with and without depth variance, from the same starts.
 fn ends(pairs: &[Pair], kind: usize, size_px: f64, starts: usize) -> [Ends; 2] {
     let aligner = |use_depth_variance| {
         Aligner::new(AlignmentParams { use_depth_variance, ..AlignmentParams::default() })

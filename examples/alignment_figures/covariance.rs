@@ -1,7 +1,7 @@
 //! Fits the inflation of the covariance on some simulated scenes and validates it on others.
 //!
-//! The mean normalised squared error of six unknowns with a right covariance is 6 (3 for the
-//! translation and 3 for the rotation alone), and 95 % of the frames lie below 12.6.
+//! The mean normalised squared error of six unknowns with a correct covariance is 6 (3 each for translation and
+//! rotation alone), and 95 % of the frames are below 12.6.
 
 use std::error::Error;
 
@@ -12,10 +12,10 @@ use semidense::slam::tracker::TrackerParams;
 
 use crate::sequence::{KeyframeChoice, Recorded, TrackedFrame, track};
 
-/// What to fit on.
+/// Parameters of the fit.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
-    /// Frames of each simulated sequence
+    /// Number of frames of each simulated sequence
     #[arg(long, default_value_t = 150)]
     frames: usize,
     /// Tracker parameters, e.g. `alignment.huber=2.0;reference.finest_level=0`
@@ -37,7 +37,7 @@ const FIT: [Case; 3] = [
     Case { scene: SceneKind::Plane, seed: 13, image_noise: 1.0, depth_noises: &[0.02, 0.1] },
 ];
 
-/// Seeds and depth noises that the fit has not seen; 14 runs of 149 frames.
+/// Seeds and depth noises not used in the fit; 14 runs of 149 frames.
 const VALIDATION: [Case; 7] = [
     Case { scene: SceneKind::Room, seed: 31, image_noise: 2.0, depth_noises: &[0.03, 0.07] },
     Case { scene: SceneKind::Room, seed: 32, image_noise: 4.0, depth_noises: &[0.015, 0.08] },
@@ -112,7 +112,7 @@ fn mean(errors: &Normalized, part: usize) -> f64 {
     errors.iter().map(|error| error[part]).sum::<f64>() / errors.len().max(1) as f64
 }
 
-/// Share of χ²₆ below this: 95 %.
+/// 95 % quantile of χ²₆.
 const CHI_SQUARE_BOUND: f64 = 12.6;
 
 fn print_row(name: &str, errors: &Normalized, factor: f64) {

@@ -1,5 +1,5 @@
-//! Figures of the alignment alone: keyframes take their depth from the source (exact for the
-//! simulator, the sensor's for recordings) with noise that their variance says.
+//! Figures of the alignment alone: keyframes take their depth from the source (exact for the simulator, the sensor's
+//! for recordings), with noise that matches their variance.
 //!
 //! ```text
 //! cargo run --release --example alignment_figures -- accuracy tum:DIR
@@ -25,7 +25,7 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Figure {
-    /// Relative pose error, normalised errors and times over one source.
+    /// Relative pose error, normalised errors and times for one source.
     Accuracy(accuracy::Arguments),
     /// Fits the inflation of the covariance on some simulated scenes and validates it on others.
     Covariance(covariance::Arguments),

@@ -1,4 +1,4 @@
-//! Tracks a source on keyframes with known depth and compares every pose with the truth.
+//! Tracks a source on keyframes with known depth and compares every pose with ground truth.
 
 use std::collections::HashMap;
 use std::error::Error;
@@ -19,20 +19,20 @@ use semidense::slam::pose::PoseEstimate;
 use semidense::slam::tracker::{Tracker, TrackerParams};
 use semidense::slam::trajectory::StampedPose;
 
-/// How keyframes are made from depth.
+/// How keyframes are created from depth.
 #[derive(Debug, Clone)]
 pub struct KeyframeChoice {
-    /// Standard deviation of the noise put on the inverse depth, share of it.
+    /// Standard deviation of the noise added to the inverse depth, as a share of it.
     pub depth_noise: f64,
-    /// The noise of each point is this to a uniform power of -1 to 1 times that; 1 for all the same.
+    /// Each point's noise is multiplied by this to a uniform power of -1 to 1; 1 for uniform noise.
     pub noise_spread: f64,
-    /// Smallest gradient of a point, grey levels a pixel.
+    /// Minimum gradient of a point, grey levels per pixel.
     pub min_gradient: f64,
-    /// A new keyframe after as many frames; 0 where the tracker proposes one.
+    /// Number of frames between keyframes; 0 to start one when the tracker proposes it.
     pub every: usize,
 }
 
-/// One tracked frame against the truth.
+/// A tracked frame compared with ground truth.
 #[derive(Debug, Clone)]
 pub struct TrackedFrame {
     pub estimate: PoseEstimate,
@@ -42,7 +42,7 @@ pub struct TrackedFrame {
     pub unit_m: f64,
     pub truth: SE3,
     pub track_ms: f64,
-    /// Points of the keyframe, and the time to prepare it.
+    /// Number of points of the keyframe, and the time to prepare it.
     pub points: usize,
     pub prepare_ms: f64,
 }
@@ -54,7 +54,7 @@ impl TrackedFrame {
     }
 }
 
-/// A small fixed generator (SplitMix64) of normal numbers.
+/// A small pseudo-random generator (SplitMix64) of normal numbers.
 pub struct Noise(pub u64);
 
 impl Noise {
@@ -74,7 +74,7 @@ impl Noise {
     }
 }
 
-/// A source kept in memory, so that it can be tracked many times.
+/// A source held in memory, so that it can be tracked many times.
 pub struct Recorded {
     source: Box<dyn FrameSource>,
     frames: Vec<(FrameStamp, Vec<u8>)>,
@@ -101,8 +101,8 @@ impl Recorded {
         Ok(Self { source, frames, truth, depths: HashMap::new() })
     }
 
-    /// The keyframe of frame `index`, at its true pose with depth as `choice` says; `None` without true depth
-    /// or pose.
+    /// The keyframe of frame `index`, at its true pose, with depth according to `choice`; `None` without true depth or
+    /// pose.
     pub fn keyframe(
         &mut self,
         index: usize,
@@ -136,7 +136,7 @@ impl Recorded {
     }
 }
 
-/// Runs the tracker over `source`.
+/// Tracks the frames of `source`.
 pub fn track(
     source: &mut Recorded,
     params: &TrackerParams,
@@ -210,7 +210,7 @@ fn view<'a>(stamp: &FrameStamp, intrinsics: &Intrinsics, pixels: &'a [u8]) -> Fr
     }
 }
 
-/// Smallest standard deviation of an inverse depth, share of it: that of exact depth in f32.
+/// Minimum relative standard deviation of an inverse depth: that of exact depth in f32.
 const EXACT_DEPTH: f64 = 1e-3;
 
 #[allow(clippy::too_many_arguments)]

@@ -1,4 +1,4 @@
-//! Intervals of single points over the frames, as an SVG picture.
+//! Intervals of single points over the frames, as an SVG figure.
 
 use std::error::Error;
 use std::fmt::Write;
@@ -16,31 +16,31 @@ use semidense::slam::image::buffer::Image;
 use semidense::slam::image::quads::QuadImage;
 use semidense::slam::pose::Brightness;
 
-/// What to show and where.
+/// What to show, and where.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
     /// Seed of the simulated room
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Frame that the points are chosen in
+    /// Frame in which the points are selected
     #[arg(long, default_value_t = 0)]
     first: usize,
-    /// Frames they are traced through
+    /// Number of frames through which they are traced
     #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u16).range(2..=300))]
     frames: u16,
-    /// The picture
+    /// Output file
     #[arg(long, default_value = "interval.svg")]
     output: PathBuf,
 }
 
-/// A keyframe with its true depth, and the frames after it with exact poses.
+/// A keyframe with its true depth, and the following frames with exact poses.
 struct Sequence {
     keyframe: GradientImage,
     true_depth: Image<f32>,
     frames: Vec<(QuadImage, TwoView)>,
 }
 
-/// A point's story.
+/// The history of a point.
 struct Story {
     pixel: (u16, u16),
     true_inverse_depth: f32,
@@ -100,11 +100,11 @@ fn sequence(arguments: &Arguments) -> Result<Sequence, Box<dyn Error>> {
     Ok(Sequence { keyframe, true_depth, frames: traced })
 }
 
-/// Pictures across and down.
+/// Charts across and down.
 const COLUMNS: usize = 3;
 const ROWS: usize = 2;
 
-/// The points with the most matches, each from a part of the image of its own.
+/// The points with the most matches, each from a different part of the image.
 fn stories(sequence: &Sequence, params: &IntervalParams) -> Vec<Story> {
     let (width, height) = (sequence.keyframe.width(), sequence.keyframe.height());
     let mut candidates = Vec::new();
@@ -188,10 +188,10 @@ fn legend(svg: &mut String, params: &IntervalParams) {
     }
 }
 
-/// One point: its interval after every frame as a bar, and the truth as a line.
+/// One point: its interval after every frame as a bar, and the true value as a line.
 fn chart(svg: &mut String, story: &Story, params: &IntervalParams) {
     let truth = f64::from(story.true_inverse_depth);
-    // The first intervals reach far beyond: they are cut off.
+    // The first intervals extend far beyond: they are clipped.
     let (low, high) = (0.0, 2.2 * truth);
     let (plot_width, plot_height) = (CHART.0 - LEFT - RIGHT, CHART.1 - TOP - BOTTOM);
     let y = |d: f64| TOP + (high - d.clamp(low, high)) / (high - low) * plot_height;

@@ -19,7 +19,7 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Figure {
-    /// How the intervals of some points narrow from frame to frame, against their true inverse depth.
+    /// How the intervals of some points narrow from frame to frame, compared with their true inverse depth.
     Interval(interval::Arguments),
 }
 

@@ -1,9 +1,9 @@
-//! Random ferns (Glocker et al. 2015): each says a few bits of a small image; images are alike that share many.
+//! Random ferns (Glocker et al. 2015): each encodes a few bits of a small image; similar images share many codes.
 
 use crate::footage::Footage;
 use crate::methods::{Scores, busy_secs};
 
-/// Ferns, tests of each, and size of the small image.
+/// Ferns, tests per fern, and size of the small image.
 const FERNS: usize = 500;
 const TESTS: usize = 4;
 const SIZE: [usize; 2] = [40, 30];
@@ -12,7 +12,7 @@ const SIZE: [usize; 2] = [40, 30];
 pub struct Ferns(Vec<(usize, u8)>);
 
 impl Ferns {
-    /// Over all pairs.
+    /// Scores of all pairs.
     pub fn scores(footage: &Footage, queries: &[Vec<u8>]) -> Scores {
         let ferns = Self::new();
         let size = [footage.camera.width, footage.camera.height];
@@ -43,7 +43,7 @@ impl Ferns {
         Self((0..FERNS * TESTS).map(|_| (below(SIZE[0] * SIZE[1]), below(256) as u8)).collect())
     }
 
-    /// Of an image whose brightness is stretched to the whole range, against exposure.
+    /// Codes of an image whose brightness is stretched to the whole range, to compensate for exposure.
     fn codes(&self, pixels: &[u8], [width, height]: [usize; 2]) -> Vec<u8> {
         let mut small = Vec::with_capacity(SIZE[0] * SIZE[1]);
         for row in 0..SIZE[1] {

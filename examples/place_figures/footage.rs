@@ -1,4 +1,4 @@
-//! Keyframes of a sequence, and what they share by the truth.
+//! Keyframes of a sequence, and the view they share according to ground truth.
 
 use std::error::Error;
 use std::fs;
@@ -31,11 +31,11 @@ pub struct Footage {
     depths: Vec<f64>,
 }
 
-/// Errors that are the same on every run.
+/// Pseudo-random errors, identical on every run.
 struct Noise(u64);
 
 impl Noise {
-    /// Of about a normal distribution, standard deviation 1: the sum of twelve even ones.
+    /// Approximately normal with standard deviation 1: the sum of twelve uniform numbers.
     fn normal(&mut self) -> f64 {
         let mut even = || {
             self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
@@ -45,7 +45,7 @@ impl Noise {
     }
 }
 
-/// How much two keyframes share: the least and the most that it can be.
+/// Lower and upper bound on the share of their view that two keyframes have in common.
 #[derive(Debug, Clone, Copy)]
 pub struct Overlap {
     pub least: f64,
@@ -53,7 +53,7 @@ pub struct Overlap {
 }
 
 impl Footage {
-    /// Frames with a true pose; of a source with depth those with depth.
+    /// Reads the frames with a true pose and, if the source has it, their depth.
     pub fn read(arguments: &Arguments) -> Result<Self, Box<dyn Error>> {
         let mut params = SourceParams::default();
         params.simulator.seed = arguments.seed;
@@ -75,7 +75,7 @@ impl Footage {
             if (number - 1) % arguments.stride != 0 {
                 continue;
             }
-            /// Half a frame's period.
+            /// Half the period of frames.
             const NEAR_NANOS: u64 = 17_000_000;
             let nearest = truth.iter().min_by_key(|p| p.nanos.abs_diff(stamp.capture_nanos));
             let Some(pose) = nearest.filter(|p| p.nanos.abs_diff(stamp.capture_nanos) < NEAR_NANOS)
@@ -89,7 +89,7 @@ impl Footage {
         Ok(Self { camera, frames, depths: arguments.depths.clone() })
     }
 
-    /// The keyframes as they ask, darkened and rolled.
+    /// The keyframes as queries, darkened and rolled.
     pub fn queries(&self, contrast: f32, roll_deg: f32) -> Vec<Vec<u8>> {
         let (width, height) = (self.camera.width, self.camera.height);
         let (sin, cos) = roll_deg.to_radians().sin_cos();
@@ -113,8 +113,8 @@ impl Footage {
         self.frames.iter().map(of).collect()
     }
 
-    /// A frame as a keyframe with its place and unit, the mean depth: pixels of the mapper's choice, with depth that errs
-    /// by `depth_error` of it. `None` where it has none.
+    /// A frame as a keyframe at its true pose, with the mean depth as unit: pixels selected as by the mapper, with
+    /// depth that has the relative error `depth_error`. `None` without depth.
     pub fn keyframe(&self, number: usize, depth_error: f64) -> Option<Keyframe> {
         let frame = self.frames.get(number)?;
         let depth = frame.depth.as_ref()?;
@@ -150,7 +150,7 @@ impl Footage {
         (sum > 0.0).then(|| Keyframe::at(place, self.camera, points, frame.pixels.clone()))
     }
 
-    /// Of every pair the share that each sees of the other.
+    /// For every pair, the share that each sees of the other.
     pub fn overlaps(&self) -> Vec<Vec<Overlap>> {
         let count = self.frames.len();
         let one_way: Vec<Vec<Overlap>> =
@@ -162,7 +162,7 @@ impl Footage {
         (0..count).map(|i| (0..count).map(|j| both(i, j)).collect()).collect()
     }
 
-    /// Share of what frame `i` sees that `j` sees too: by depth, or between assumed depths.
+    /// Share of the view of frame `i` that `j` sees too: by depth, or bounded by the assumed depths.
     fn seen(&self, i: usize, j: usize) -> Overlap {
         let (i, j) = (&self.frames[i], &self.frames[j]);
         let j_from_i = j.world_from_camera.inverse() * i.world_from_camera;
@@ -183,9 +183,9 @@ impl Footage {
         depth_at: impl Fn(usize, usize) -> Option<f64>,
         theirs: Option<&Image<f32>>,
     ) -> f64 {
-        /// Pixels from one that is looked at to the next.
+        /// Pixels from one sample to the next.
         const STEP: usize = 16;
-        /// Depths that differ by more hide each other.
+        /// Relative difference of depths above which a point is occluded.
         const HIDDEN: f64 = 0.15;
         let Intrinsics { width, height, fx, fy, cx, cy, .. } = self.camera;
         let (mut all, mut seen) = (0, 0);
@@ -211,7 +211,7 @@ impl Footage {
         f64::from(seen as u32) / f64::from(all.max(1) as u32)
     }
 
-    /// Writes the keyframes as PGM files, and what they share as `least/most`, a line for each keyframe.
+    /// Writes the keyframes as PGM files, and their overlaps as `least/most`, a line for each keyframe.
     pub fn export(&self, folder: &Path, overlaps: &[Vec<Overlap>]) -> Result<(), Box<dyn Error>> {
         fs::create_dir_all(folder)?;
         for (number, frame) in self.frames.iter().enumerate() {

@@ -1,22 +1,22 @@
-//! How well a method finds places again.
+//! How well a method recognises places.
 
 use crate::footage::Overlap;
 use crate::methods::Scores;
 
-/// Keyframes of which each sees at least so much of the other show the same place.
+/// Keyframes that each see at least this share of the other show the same place.
 pub const SAME: f64 = 0.3;
-/// Those that share no more than this show different ones; what is between does not count.
+/// Keyframes that share no more than this show different places; those in between do not count.
 pub const OTHER: f64 = 0.05;
-/// Candidates that a verification could look at.
+/// Number of candidates that a verification could check.
 pub const FEW: usize = 3;
 
-/// Queries that a place could be found for.
+/// Number of queries with a place that could be found.
 pub fn count_revisits(overlaps: &[Vec<Overlap>], gap: usize) -> usize {
     let has = |i: &usize| (0..i.saturating_sub(gap)).any(|j| overlaps[*i][j].least >= SAME);
     (0..overlaps.len()).filter(has).count()
 }
 
-/// Prints recall among the keyframes that lie `gap` and more before, and by how much is shared.
+/// Prints recall among the keyframes at least `gap` before the query, also by shared view.
 pub fn judge(overlaps: &[Vec<Overlap>], scores: &Scores, gap: usize) {
     let mut best: Vec<(f32, f64, f64)> = Vec::new();
     let (mut revisits, mut first, mut few) = (0, 0, 0);
@@ -47,15 +47,15 @@ pub fn judge(overlaps: &[Vec<Overlap>], scores: &Scores, gap: usize) {
     by_overlap(overlaps, scores);
 }
 
-/// The keyframes of a sequence, in order of their scores.
+/// The keyframes of a sequence in descending order of their scores.
 fn ranked(scores: &[f32], among: std::ops::Range<usize>) -> Vec<usize> {
     let mut order: Vec<usize> = among.filter(|&j| !scores[j].is_nan()).collect();
     order.sort_by(|&a, &b| scores[b].total_cmp(&scores[a]));
     order
 }
 
-/// Of queries with a keyframe that shares so much, those with one of them among the first few, where those that share
-/// more are left out.
+/// For each band of shared view: of the queries with a keyframe in the band, those with such a keyframe among the
+/// first few candidates, where keyframes that share more are excluded.
 fn by_overlap(overlaps: &[Vec<Overlap>], scores: &Scores) {
     const BANDS: [(f64, f64); 4] = [(0.3, 0.45), (0.45, 0.6), (0.6, 0.75), (0.75, 0.9)];
     let of = |(from, to): (f64, f64)| {

@@ -1,5 +1,5 @@
-//! Figures of place recognition: frames of a sequence as keyframes, the earlier ones found by the later ones, judged by
-//! what both see by the truth.
+//! Figures of place recognition: frames of a sequence as keyframes, later ones looked up among earlier ones, judged by
+//! the view they share according to ground truth.
 //!
 //! ```text
 //! cargo run --release --example place_figures -- sim:room --frames 600 --stride 10
@@ -22,27 +22,27 @@ use semidense::capture::source_name::SourceName;
 use crate::footage::Footage;
 use crate::methods::{Kind, Scores};
 
-/// Finds places of a sequence again by several methods.
+/// Recognises places of a sequence by several methods.
 #[derive(Debug, Parser)]
 struct Arguments {
     /// Source of the frames.
     source: SourceName,
-    /// Every so many frames is a keyframe.
+    /// Use every n-th frame as a keyframe.
     #[arg(long, default_value_t = 10)]
     stride: usize,
-    /// Frames read of it.
+    /// Number of frames to read.
     #[arg(long)]
     frames: Option<usize>,
     /// Seed of the simulator.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Trajectory in place of the source's ground truth.
+    /// Trajectory that replaces the source's ground truth.
     #[arg(long)]
     truth: Option<PathBuf>,
-    /// Depths that are assumed where the source has none, lengths of the truth.
+    /// Assumed depths for a source without depth, in units of the truth.
     #[arg(long, value_delimiter = ',', default_values_t = [1.0, 2.0, 4.0])]
     depths: Vec<f64>,
-    /// Keyframes that must lie between a query and what it may find.
+    /// Number of keyframes that must lie between a query and what it may find.
     #[arg(long, default_value_t = 10)]
     gap: usize,
     /// Methods to compare.
@@ -51,17 +51,17 @@ struct Arguments {
     /// File with the scores of another method: a line for each query, a number for each keyframe.
     #[arg(long)]
     scores: Option<PathBuf>,
-    /// Folder to write the keyframes to as PGM files, for other methods.
+    /// Folder to export the keyframes to as PGM files, for other methods.
     #[arg(long)]
     export: Option<PathBuf>,
-    /// Seconds of wear: every keyframe that asks is darkened to this share of its contrast.
+    /// Factor on the grey levels of every query keyframe, which lowers its contrast.
     #[arg(long, default_value_t = 1.0)]
     contrast: f32,
-    /// Degrees by which every keyframe that asks is rolled.
+    /// Degrees by which every query keyframe is rolled.
     #[arg(long, default_value_t = 0.0)]
     roll: f32,
-    /// Align the tree's best candidates as the search for loops does, with true depth that errs by so much (0.01: 1 %),
-    /// independently from pixel to pixel.
+    /// Align the tree's best candidates as the loop search does, with true depth plus relative errors of this size
+    /// (0.01: 1 %), independent from pixel to pixel.
     #[arg(long, conflicts_with_all = ["roll", "contrast", "truth"])]
     verify: Option<f64>,
 }

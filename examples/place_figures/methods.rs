@@ -1,4 +1,4 @@
-//! The methods that are compared: each says of every keyframe that asks how alike every other one is.
+//! The methods compared: each scores the similarity of a query keyframe to every other keyframe.
 
 use std::error::Error;
 use std::fs;
@@ -11,7 +11,7 @@ use semidense::slam::places::{Describer, PlaceCandidate, PlaceIndex};
 use crate::ferns::Ferns;
 use crate::footage::Footage;
 
-/// A method.
+/// A method of place recognition.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Kind {
     /// Binary descriptors in a tree.
@@ -22,18 +22,18 @@ pub enum Kind {
     Ferns,
 }
 
-/// What a method says.
+/// Result of a method.
 pub struct Scores {
-    /// For each query a number for each keyframe, larger the more alike, NaN where it says nothing.
+    /// For each query a score for each keyframe, higher for greater similarity, NaN without one.
     pub of: Vec<Vec<f32>>,
-    /// What the tree says where it is asked only for keyframes that may be found: for each query its candidates, best
-    /// first. Empty of other methods.
+    /// The tree's result when restricted to keyframes that may be found: for each query its candidates, best first.
+    /// Empty for other methods.
     pub candidates: Vec<Vec<PlaceCandidate>>,
-    /// What it costs, to be printed.
+    /// The cost, as text.
     pub cost: String,
 }
 
-/// Of a method over all pairs; `gap` keyframes before a query and what is newer need not be found.
+/// Runs a method on all pairs; the last `gap` keyframes before a query and all later ones need not be found.
 pub fn scores(kind: Kind, footage: &Footage, queries: &[Vec<u8>], gap: usize) -> Scores {
     match kind {
         Kind::Tree => tree(footage, queries, gap),
@@ -42,7 +42,7 @@ pub fn scores(kind: Kind, footage: &Footage, queries: &[Vec<u8>], gap: usize) ->
     }
 }
 
-/// Time of this thread on a processor, seconds: others may be busy on the machine.
+/// CPU time of this thread, seconds, unaffected by other load on the machine.
 pub fn busy_secs() -> f64 {
     let time = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
     time.tv_sec as f64 + 1e-9 * time.tv_nsec as f64
@@ -111,7 +111,7 @@ fn small(footage: &Footage, queries: &[Vec<u8>]) -> Scores {
     Scores { of, candidates: Vec::new(), cost }
 }
 
-/// Of a file: a line for each query.
+/// Reads scores from a file with a line for each query.
 pub fn read_scores(file: &Path) -> Result<Scores, Box<dyn Error>> {
     let text = fs::read_to_string(file)?;
     let row = |line: &str| line.split_whitespace().map(str::parse).collect::<Result<Vec<f32>, _>>();

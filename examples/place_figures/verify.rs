@@ -1,4 +1,4 @@
-//! What is left of the candidates when they are aligned as the search for loops aligns them, and judged by the truth.
+//! How many candidates survive the alignment of the loop search, judged by ground truth.
 
 use std::collections::BTreeMap;
 
@@ -11,17 +11,17 @@ use semidense::slam::places::PlaceCandidate;
 use crate::footage::{Footage, Overlap};
 use crate::judge::{FEW, OTHER, SAME};
 
-/// A pair that was measured.
+/// A measured pair.
 struct Verdict {
     score: f32,
-    /// Whether the keyframes see each other enough; `None` of those between.
+    /// Whether the keyframes see enough of each other; `None` in between.
     is_same: Option<bool>,
-    /// Whether the measurement is the truth; or why there is none.
+    /// Whether the measurement is correct, or why there is none.
     measured: Result<bool, Refusal>,
 }
 
-/// Prints recall among the keyframes that lie `gap` and more before, after the alignment of the first and of the first
-/// few.
+/// Prints recall among the keyframes at least `gap` before the query, after aligning the first and the first few
+/// candidates.
 pub fn verify(
     footage: &Footage,
     overlaps: &[Vec<Overlap>],
@@ -66,7 +66,7 @@ pub fn verify(
     println!("    refused of pairs that see the same: {refusals:?}");
 }
 
-/// Whether a measured similarity is that of the truth: metres, and degrees.
+/// Whether a measured similarity agrees with the truth: metres and degrees.
 fn is_true(i: &Keyframe, j: &Keyframe, j_from_i: &Sim3) -> bool {
     const FALSE_M: f64 = 0.2;
     const FALSE_DEG: f64 = 8.0;
@@ -77,7 +77,7 @@ fn is_true(i: &Keyframe, j: &Keyframe, j_from_i: &Sim3) -> bool {
     moved.norm() * world_from_j.scale <= FALSE_M && turned <= FALSE_DEG
 }
 
-/// What the first `most` candidates come to. Of a keyframe the first pair that is accepted counts.
+/// Prints the outcome for the first `most` candidates. For each keyframe the first accepted pair counts.
 fn report(measured: &[(bool, Vec<Verdict>)], revisits: usize, most: usize) {
     let pairs = || measured.iter().flat_map(|(_, of)| of.iter().take(most));
     let count = |is: &dyn Fn(&Verdict) -> bool| pairs().filter(|of| is(of)).count();
@@ -96,7 +96,7 @@ fn report(measured: &[(bool, Vec<Verdict>)], revisits: usize, most: usize) {
         };
         measured.iter().filter(|(is_revisit, of)| *is_revisit && first(of)).count()
     };
-    /// Least score of the search for loops.
+    /// Minimum score of the loop search.
     const LIKELY: f32 = 20.0;
     let share = |count: usize| 100.0 * count as f64 / revisits.max(1) as f64;
     println!(
