@@ -1,4 +1,4 @@
-//! After warm-up neither tracking or holding a frame nor preparing a keyframe nor tracing points allocates.
+//! After warm-up, tracking or holding a frame, preparing a keyframe and tracing points do not allocate.
 
 #[allow(dead_code, reason = "every test uses its part of what they share")]
 #[path = "support/counting_allocator.rs"]
@@ -37,7 +37,7 @@ fn a_frame_and_a_keyframe_allocate_nothing_after_warm_up() {
         if index == 2 {
             before = allocations();
         }
-        // Two references take turns, as in the shell: one active, one being prepared.
+        // Two references alternate, as in the process: one active, one being prepared.
         let mut reference =
             spare.take().unwrap_or_else(|| Box::new(Reference::new(ReferenceParams::default())));
         reference.prepare_into(keyframe, &mut scratch);
@@ -72,7 +72,7 @@ fn panorama(angle: f64) -> Vec<u8> {
         .collect()
 }
 
-/// Pans away from a keyframe; what is tracked on it is in warm memory, and all that is held afterwards too.
+/// Pans away from a keyframe: tracked frames run in warm memory, and so do all held ones.
 fn holding_a_view_allocates_nothing() {
     const FRAMES: u64 = 40;
     let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
@@ -99,8 +99,8 @@ fn holding_a_view_allocates_nothing() {
     assert!(held > 10, "only {held} frames were held: this measures nothing");
 }
 
-/// Two keyframes of points, each traced through some frames; the second one is in warm memory. Part of
-/// the only test of this file: what another one allocated meanwhile would be counted.
+/// Two keyframes of points, each traced through some frames; the second one runs in warm memory. Part of the only test
+/// of this file: allocations of a concurrent test would be counted.
 fn tracing_points_allocates_nothing() {
     let (mut map, mut filter) =
         (DepthMap::with_size(CAMERA.width, CAMERA.height), IntervalFilter::default());

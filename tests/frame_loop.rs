@@ -1,6 +1,6 @@
-//! The tracker's frame loop as it runs in its process: once warm, it allocates nothing, touches no new page,
-//! and gives up its CPU only to wait for the next frame. What iceoryx2 itself allocates is counted apart:
-//! the same calls to shared memory without a tracker.
+//! The tracker's frame loop as in its process: once warm, it allocates nothing, touches no new page, and yields its
+//! CPU only to wait for the next frame. Allocations by iceoryx2 itself are counted separately, from the same calls to
+//! shared memory without a tracker.
 
 #[allow(dead_code, reason = "every test uses its part of what they share")]
 #[path = "support/counting_allocator.rs"]
@@ -33,18 +33,18 @@ use semidense::wire::topic::{FRAME, KEYFRAME, KEYFRAME_IMAGE, POSE, TRACKER_HEAL
 use counting_allocator::{allocations, count_here};
 use waves::{CAMERA, header, image, keyframe};
 
-/// Frames until everything has been touched.
+/// Frames until all memory has been touched.
 const WARM_UP: u64 = 150;
 /// Frames that are counted.
 const COUNTED: u64 = 300;
 /// Pause between two frames: the loop must wait for each.
 const PAUSE: Duration = Duration::from_millis(2);
-/// Page faults that are allowed where the system refuses to lock memory.
+/// Page faults allowed if the system refuses to lock memory.
 const UNLOCKED_PAGE_FAULTS: u64 = 20;
-/// Far above anything that is expected: it ends a test that hangs.
+/// Far above any expected duration: it ends a test that hangs.
 const WATCH_DOG: Duration = Duration::from_secs(120);
 
-/// What stands for capture and mapper.
+/// Substitute for capture and mapper.
 struct Others {
     frames: Publisher<u8, FrameHeader>,
     poses: Subscriber<PoseMessage, ()>,
@@ -78,7 +78,7 @@ impl Others {
         }
     }
 
-    /// Sends frame after frame until `count` have had their pose.
+    /// Sends frames until `count` of them have a pose.
     fn send(&mut self, count: u64) {
         let (mut answered, start) = (0, Instant::now());
         while answered < count {
@@ -102,7 +102,7 @@ impl Others {
     }
 }
 
-/// The calls to shared memory of a frame loop that tracks nothing.
+/// The shared-memory calls of a frame loop that tracks nothing.
 fn echo(place: &Place, shutdown: &Shutdown) {
     let hub = Hub::join(place, "tracker", Access::Member).unwrap();
     let frames: Subscriber<u8, FrameHeader> = hub.subscriber(&FRAME).unwrap();
@@ -126,7 +126,7 @@ fn echo(place: &Place, shutdown: &Shutdown) {
     }
 }
 
-/// What a thread has done.
+/// Resources used by a thread.
 #[derive(Debug, Clone, Copy)]
 struct Cost {
     allocations: u64,
@@ -135,11 +135,11 @@ struct Cost {
 }
 
 impl Cost {
-    /// So far, of the thread `tid`, by the kernel's account.
+    /// Use so far by the thread `tid`, according to the kernel.
     fn of(tid: i32) -> Self {
         let read = |file| fs::read_to_string(format!("/proc/self/task/{tid}/{file}")).unwrap();
         let stat = read("stat");
-        // Behind the name, which may hold anything: state is field 3, minor and major faults are 10 and 12.
+        // After the name, which may contain anything: state is field 3, minor and major faults are 10 and 12.
         let fields: Vec<&str> = stat.rsplit_once(')').unwrap().1.split_whitespace().collect();
         let field = |number: usize| fields[number - 3].parse::<u64>().unwrap();
         let status = read("status");
@@ -161,8 +161,7 @@ impl Cost {
     }
 }
 
-/// What `COUNTED` warm frames cost a loop that runs in a thread of its own, and how many of them were
-/// tracked.
+/// Cost of `COUNTED` warm frames for a loop that runs in a separate thread, and how many of them were tracked.
 fn cost_of(run: impl FnOnce(&Place, &Shutdown) + Send + 'static) -> (Cost, u64) {
     let folder = tempfile::tempdir().unwrap();
     let place = Place::new("loop", folder.path().to_str().unwrap()).unwrap();
@@ -181,7 +180,7 @@ fn cost_of(run: impl FnOnce(&Place, &Shutdown) + Send + 'static) -> (Cost, u64) 
     let (before, tracked, reports) = (Cost::of(tid), others.tracked, others.reports);
     others.send(COUNTED);
     let mut cost = Cost::of(tid).since(before);
-    // A report of its health costs the transport as much as a pose.
+    // A health report costs the transport as much as a pose.
     cost.allocations = cost.allocations.saturating_sub(others.reports - reports);
     let tracked = others.tracked - tracked;
     signal_hook::low_level::raise(signal_hook::consts::SIGTERM).unwrap();
@@ -190,7 +189,7 @@ fn cost_of(run: impl FnOnce(&Place, &Shutdown) + Send + 'static) -> (Cost, u64) 
 }
 
 #[test]
-fn the_loop_allocates_only_what_its_transport_does() {
+fn the_loop_allocates_no_more_than_its_transport() {
     let (of_transport, _) = cost_of(echo);
     let (of_loop, tracked) = cost_of(|place, shutdown| {
         let mut config = Config {
@@ -198,7 +197,7 @@ fn the_loop_allocates_only_what_its_transport_does() {
             root: place.root.display().to_string(),
             ..Config::default()
         };
-        // Frames come as fast as they are answered: half a period is no deadline.
+        // Frames are sent as fast as they are answered: half a period is no suitable deadline.
         config.tracker.deadline_ms = 1000.0;
         config.tracker.scheduling.lock_memory = true;
         config.tracker.early_wake_us = 300.0;
@@ -213,6 +212,6 @@ fn the_loop_allocates_only_what_its_transport_does() {
     assert!(of_loop.allocations <= of_transport.allocations, "{line}");
     let allowed = if in_force().memory_locked { 0 } else { UNLOCKED_PAGE_FAULTS };
     assert!(of_loop.page_faults <= allowed, "{line}");
-    // One wait a frame, and some that a stale wake-up has ended early.
+    // One wait per frame, and some that a stale wake-up ended early.
     assert!(of_loop.waits <= COUNTED + COUNTED / 5 + 20, "{line}");
 }

@@ -1,4 +1,4 @@
-//! `semidense bench`: that its reports are complete; what it measures is for people, not for a test.
+//! `semidense bench`: its reports are complete; the measurements are for people, not for a test.
 
 #[allow(dead_code, reason = "every test uses its part of what they share")]
 mod support;
@@ -8,11 +8,11 @@ use support::{Rig, finish, small_camera};
 
 /// 1 000 frames.
 const TRIAL: [&str; 6] = ["--fps", "60", "--seconds", "16.667", "--realtime", "on"];
-/// A name of the user's: the bench's processes have one of their own.
+/// An instance name of the user's: the processes of the benchmark have a different one.
 const NAMED: [&str; 2] = ["--instance", "named"];
 const FRAMES: u64 = 1000;
 
-/// The measurements of trials on a small camera.
+/// The measurements of trials with a small camera.
 fn bench(arguments: &[&str]) -> Vec<Value> {
     let rig = Rig::new();
     let mut command = rig.command(&["bench", "latency", "--json"]);
@@ -43,7 +43,7 @@ fn assert_complete(measurement: &Value, frames: u64) {
 }
 
 #[test]
-fn a_thousand_frames_with_every_cpu_busy_give_a_whole_report() {
+fn a_thousand_frames_with_every_cpu_busy_give_a_complete_report() {
     let measurements = bench(&[&TRIAL[..], &NAMED, &["--load", "busy-cpus"]].concat());
     assert_eq!(measurements.len(), 1);
     assert_eq!(measurements[0]["disturbance"], "busy_cpus");

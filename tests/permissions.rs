@@ -1,5 +1,4 @@
-//! Nobody but the user of the service can read or write what it shares: folders, files, sockets, shared
-//! memory.
+//! Only the user of the service can read or write what it shares: folders, files, sockets, shared memory.
 
 #[allow(dead_code, reason = "every test uses its part of what they share")]
 mod support;
@@ -14,10 +13,10 @@ use semidense::wire::folders::SHARED_MEMORY;
 use semidense::wire::topic::MAPPER_HEALTH;
 use support::{Rig, end, signal, until};
 
-/// Rights of the group and of all others.
+/// Permissions of the group and of all others.
 const NOT_THE_USER: u32 = 0o077;
 
-/// Everything below `folder`, itself included.
+/// Collects everything below `folder`, including itself.
 fn below(folder: &Path, found: &mut Vec<PathBuf>) {
     found.push(folder.to_owned());
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
@@ -29,9 +28,9 @@ fn below(folder: &Path, found: &mut Vec<PathBuf>) {
 }
 
 #[test]
-fn what_a_run_shares_is_for_its_user_alone() {
+fn files_shared_by_a_run_are_accessible_to_its_user_only() {
     let rig = Rig::new();
-    // The usual mask of a login; with 0 only what is asked for protects.
+    // Logins usually set a mask; with 0, only explicitly requested permissions protect.
     rustix::process::umask(rustix::fs::Mode::from_raw_mode(0));
     let child = rig.run(60, &["--live", "--source", "loop:1000000:20:sim"]).spawn().unwrap();
     let hub = rig.observe();
@@ -56,7 +55,7 @@ fn what_a_run_shares_is_for_its_user_alone() {
         .chain(&own)
         .filter_map(|path| Some((path, fs::symlink_metadata(path).ok()?.permissions().mode())))
         .filter(|(path, mode)| {
-            // A folder that cannot be entered protects all below it.
+            // A folder that cannot be entered protects everything below it.
             let is_within = path.starts_with(rig.root()) && **path != rig.root();
             !is_within && mode & NOT_THE_USER != 0
         })

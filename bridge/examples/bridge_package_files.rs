@@ -1,5 +1,5 @@
-//! Writes what a package installs beside the binary and what the command line itself describes: man pages and shell
-//! completions.
+//! Writes the files that a package installs next to the binary and that the command line itself describes:
+//! man pages and shell completions.
 //!
 //!     cargo run --release -p semidense-bridge --example bridge_package_files -- FOLDER
 

@@ -1,4 +1,4 @@
-//! The command line: one short file a subcommand in `command/`.
+//! The command line: one short file per subcommand in `command/`.
 
 pub mod record;
 #[cfg(feature = "ros2")]
@@ -19,10 +19,10 @@ use semidense::service::config::{Config, SYSTEM_FOLDER, file_for};
 use semidense::wire::place::Place;
 use tracing_subscriber::EnvFilter;
 
-/// Heading of the options that every command has.
+/// Help heading of the options common to all commands.
 const COMMON: &str = "Common options";
 
-/// What a command may fail with: one line for the user.
+/// A command's exit code, or its error as one line for the user.
 pub type CommandResult = Result<ExitCode, Box<dyn Error>>;
 
 #[derive(Debug, Parser)]
@@ -41,7 +41,7 @@ struct CommandLine {
     command: Subcommands,
 }
 
-/// Options that every command has, as of `semidense`.
+/// Options common to all commands, as in `semidense`.
 #[derive(Debug, Clone, Args)]
 pub struct CommonArguments {
     /// Configuration file [default: /etc/semidense/NAME.toml for the instance NAME, else
@@ -51,13 +51,13 @@ pub struct CommonArguments {
     /// Name of the instance [default: semidense]
     #[arg(long, global = true, help_heading = COMMON, value_name = "NAME")]
     pub instance: Option<String>,
-    /// What to log on standard error: error, warn, info, debug or trace
+    /// Log level on standard error: error, warn, info, debug or trace
     #[arg(long, global = true, help_heading = COMMON, value_name = "LEVEL", default_value = "warn")]
     pub log: String,
 }
 
 impl CommonArguments {
-    /// Where the instance lives, by command line, configuration and environment.
+    /// Place of the instance, from command line, configuration and environment.
     pub fn place(&self) -> Result<Place, Box<dyn Error>> {
         let named: Vec<String> =
             self.instance.iter().map(|name| format!("instance={name:?}")).collect();
@@ -79,7 +79,7 @@ enum Subcommands {
     Zenoh(zenoh::ZenohArguments),
 }
 
-/// The command line, for manual and completions.
+/// The command line, for the manual and completions.
 pub fn command_line() -> clap::Command {
     CommandLine::command()
 }
@@ -94,12 +94,12 @@ pub fn main() -> ExitCode {
     })
 }
 
-/// A line for the user. Standard error may be closed; there is nobody else to tell.
+/// Prints a line for the user. A closed standard error is ignored: the failure could not be reported.
 fn note(line: &str) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }
 
-/// A number within `range`, or the text of what is `wanted`.
+/// Parses a number within `range`; the error text is `wanted`.
 fn number_within<T: FromStr + PartialOrd>(
     text: &str,
     range: RangeInclusive<T>,
@@ -109,8 +109,8 @@ fn number_within<T: FromStr + PartialOrd>(
 }
 
 fn run(line: CommandLine) -> CommandResult {
-    // Zenoh warns of scouting that is off on purpose; the middleware of ROS 2 without end where loopback has no
-    // multicast, as everywhere.
+    // Zenoh warns of scouting that is disabled on purpose; the ROS 2 middleware warns endlessly where
+    // loopback has no multicast, as is usual.
     let log = format!("zenoh=error,rustdds=off,ros2_client=off,{}", line.common.log);
     let filter =
         EnvFilter::try_new(&log).map_err(|error| format!("--log {}: {error}", line.common.log))?;

@@ -1,7 +1,7 @@
-//! One thread reads an instance's topics for any number of clients.
+//! One thread that reads an instance's topics for any number of clients.
 //!
-//! Each [`Listener`] has a bounded channel: one that does not keep up loses events, which are counted, and holds up neither
-//! the reading nor the others. A listener that comes late first gets the newest event of each kind.
+//! Each [`Listener`] has a bounded channel: a slow one loses events, which are counted, and delays neither
+//! the reading nor the other listeners. A late listener first receives the newest event of each kind.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -14,12 +14,12 @@ use semidense::wire::place::Place;
 
 use crate::session::{Event, Session, SessionError, Wants};
 
-/// Longest time until a change of the listeners or the end of the feed is noticed where no message comes.
+/// Upper limit for the delay until a change of listeners or the end of the feed is noticed while no message arrives.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
-/// Events that a listener has room for where it does not say: two seconds of poses at 30 Hz.
+/// Default capacity of a listener in events: two seconds of poses at 30 Hz.
 pub const USUAL_DEPTH: usize = 64;
 
-/// Why a feed does not start.
+/// Why a feed cannot be started.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot start the thread that reads the topics ({0})")]
 pub struct FeedError(#[from] std::io::Error);
@@ -32,7 +32,7 @@ pub struct Feed {
 }
 
 impl Feed {
-    /// Reads `wants` of the instance at `place` under the process name `name`, whenever it runs.
+    /// Starts reading `wants` of the instance at `place`, whenever it runs, under the process name `name`.
     pub fn start(place: Place, name: &str, wants: Wants) -> Result<Self, FeedError> {
         let shared = Arc::<Shared>::default();
         let (theirs, name) = (Arc::clone(&shared), name.to_owned());
@@ -42,17 +42,17 @@ impl Feed {
         Ok(Self { shared, thread: Some(thread) })
     }
 
-    /// A listener with room for `depth` events, [`USUAL_DEPTH`] as a rule.
+    /// Adds a listener with room for `depth` events, usually [`USUAL_DEPTH`].
     pub fn listen(&self, depth: usize) -> Listener {
         self.shared.lock().listen(depth)
     }
 
-    /// Why the reading has ended; `None` while it continues.
+    /// Why reading has ended; `None` while it continues.
     pub fn failure(&self) -> Option<String> {
         self.shared.lock().failure.clone()
     }
 
-    /// Events that listeners have lost since the start, all together.
+    /// Events lost by all listeners together since the start.
     pub fn lost(&self) -> u64 {
         self.shared.lock().lost
     }
@@ -67,7 +67,7 @@ impl Drop for Feed {
     }
 }
 
-/// Where a client's events arrive.
+/// The receiving end of one client.
 #[derive(Debug)]
 pub struct Listener {
     events: Receiver<Event>,
@@ -75,7 +75,7 @@ pub struct Listener {
 }
 
 impl Listener {
-    /// The next event, `None` where none comes within `timeout`. An error when the feed is over.
+    /// The next event; `None` if none arrives within `timeout`, an error once the feed is over.
     pub fn next(&self, timeout: Duration) -> Result<Option<Event>, FeedOver> {
         match self.events.recv_timeout(timeout) {
             Ok(event) => Ok(Some(event)),
@@ -84,15 +84,15 @@ impl Listener {
         }
     }
 
-    /// Events that this listener has lost because it was slow.
+    /// Events lost because this listener was slow.
     pub fn lost(&self) -> u64 {
         self.lost.load(Ordering::Relaxed)
     }
 }
 
-/// Nothing more will come: see [`Feed::failure`].
+/// The feed has ended: see [`Feed::failure`].
 #[derive(Debug, thiserror::Error)]
-#[error("the topics are not read any more")]
+#[error("the topics are no longer read")]
 pub struct FeedOver;
 
 #[derive(Debug, Default)]
@@ -115,7 +115,7 @@ fn read(mut session: Session, shared: &Shared) {
             break;
         }
     }
-    // They hear that nothing more comes.
+    // Tells the listeners that the feed is over.
     shared.lock().outlets.clear();
 }
 
@@ -150,12 +150,12 @@ impl State {
     }
 }
 
-/// The queue to one listener.
+/// The sending end of one listener's queue.
 #[derive(Debug)]
 struct Outlet {
     sender: SyncSender<Event>,
     lost: Arc<AtomicU64>,
-    /// A beginning or end of a run that found no room: without it what comes later cannot be understood.
+    /// A start or end of a run for which there was no room: later events cannot be understood without it.
     owed: Option<Event>,
 }
 
@@ -164,7 +164,7 @@ impl Outlet {
         self.lost.load(Ordering::Relaxed)
     }
 
-    /// Whether the listener is still there.
+    /// Offers the event to the listener; returns whether that still exists.
     fn give(&mut self, event: &Event) -> bool {
         if let Some(owed) = self.owed.take()
             && let Err(error) = self.sender.try_send(owed)
@@ -190,7 +190,7 @@ impl Outlet {
     }
 }
 
-/// The newest event of each kind, for those who come late, in the order in which they get them.
+/// The newest event of each kind for late listeners, in the order of delivery.
 #[derive(Debug, Default)]
 struct Recent(BTreeMap<(u8, &'static str), Event>);
 
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_listener_loses_events_and_holds_up_nobody() {
+    fn a_slow_listener_loses_events_and_delays_nobody() {
         let mut state = State::default();
         let (slow, quick) = (state.listen(2), state.listen(8));
         state.give(&Event::Joined);
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn who_comes_late_hears_that_the_run_is_there_and_who_is_gone_is_forgotten() {
+    fn a_late_listener_learns_that_the_run_exists_and_a_departed_one_is_removed() {
         let mut state = State::default();
         state.give(&Event::Joined);
         let late = state.listen(4);

@@ -1,7 +1,7 @@
-//! The Foxglove WebSocket protocol, version 1, for one client: the topics as ROS 2's messages in CDR, live. Foxglove,
-//! Lichtblick and others that speak it show them without any adapter.
+//! The Foxglove WebSocket protocol, version 1, for one client: the topics live, as ROS 2 messages in CDR.
+//! Foxglove, Lichtblick and other programs that speak the protocol show them without an adapter.
 //!
-//! The server accepts a connection with one of [`SUBPROTOCOLS`] and calls [`serve`] on a thread of the client.
+//! The server accepts a connection with one of [`SUBPROTOCOLS`] and calls [`serve`] on the client's thread.
 
 pub mod protocol;
 mod subscriptions;
@@ -27,10 +27,10 @@ use crate::ros::topic::{
 };
 use crate::session::{Event, Graph};
 
-/// Names of the protocol in the handshake, old and new; both are the same here.
+/// Names of the protocol in the handshake, old and new; treated alike here.
 pub const SUBPROTOCOLS: [&str; 2] = ["foxglove.websocket.v1", "foxglove.sdk.v1"];
 
-/// The topics that are offered; their place is the number of their channel.
+/// The topics offered; the index of a topic is the number of its channel.
 static OFFERED: [&RosTopic; 12] = [
     &POSE,
     &ODOMETRY,
@@ -46,28 +46,28 @@ static OFFERED: [&RosTopic; 12] = [
     &GRAPH_RECORDS,
 ];
 
-/// How often the client is listened to while no event comes.
+/// How often the client's messages are read while no event arrives.
 const LISTEN_PERIOD: Duration = Duration::from_millis(20);
-/// Longest that one message may take to leave: a client that reads slower is dropped.
+/// Upper limit for the time that sending one message may take: a slower client is dropped.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
-/// Largest message of a client: it only names channels.
+/// Upper limit for a message from a client: it only names channels.
 const MAX_REQUEST_BYTES: usize = 64 << 10;
 
 /// Why serving a client ended.
 #[derive(Debug, thiserror::Error)]
 pub enum FoxgloveError {
-    /// The connection.
+    /// The connection failed.
     #[error("the connection of a Foxglove client failed: {0}")]
     Socket(#[from] Box<Error>),
-    /// The system.
+    /// A system call failed.
     #[error("the connection of a Foxglove client failed: {0}")]
     System(#[from] std::io::Error),
-    /// A message.
+    /// A message could not be encoded.
     #[error(transparent)]
     Encode(#[from] EncodeError),
 }
 
-/// Serves one client until it leaves, or until the feed is over. `next` waits for an event, as
+/// Serves one client until it disconnects or the feed ends. `next` waits for an event, as
 /// [`Listener::next`](crate::feed::Listener::next) does.
 pub fn serve(
     mut socket: WebSocket<TcpStream>,
@@ -97,7 +97,7 @@ pub fn serve(
     }
 }
 
-/// Whether the client only left.
+/// Whether the error is only the client's disconnecting.
 fn is_goodbye(error: &Error) -> bool {
     match error {
         Error::ConnectionClosed | Error::AlreadyClosed => true,
@@ -111,25 +111,25 @@ fn is_goodbye(error: &Error) -> bool {
     }
 }
 
-/// One client.
+/// A connected client.
 struct Client {
     socket: WebSocket<TcpStream>,
     subscriptions: Subscriptions,
     encoder: EventEncoder,
-    /// What comes rarely: who subscribes later gets the last.
+    /// The last rare events, for channels subscribed to later.
     keyframe: Option<Arc<Keyframe>>,
     graph: Option<Arc<Graph>>,
 }
 
-/// A client as a sink of messages.
+/// A client as a message sink.
 struct ClientSink<'a> {
     socket: &'a mut WebSocket<TcpStream>,
     subscriptions: &'a Subscriptions,
-    /// The only channel that is wanted, where it is one.
+    /// The only channel to send on, if just one.
     only: Option<usize>,
 }
 
-/// The channel of a topic.
+/// The channel number of a topic.
 fn channel(topic: &RosTopic) -> Option<usize> {
     OFFERED.iter().position(|offered| offered.name == topic.name)
 }
@@ -179,7 +179,7 @@ impl Client {
         }
     }
 
-    /// What the client has sent; `None` when that is nothing now.
+    /// The next message of the client; `None` if there is none now.
     fn listen(&mut self) -> Result<Option<Message>, FoxgloveError> {
         self.socket.get_ref().set_nonblocking(true)?;
         let read = self.socket.read();
@@ -203,7 +203,7 @@ impl Client {
         self.encoder.put(event, Moment::now(), &mut sink)
     }
 
-    /// Does what the client asks for; what cannot be done is told to it.
+    /// Executes a request of the client; failures are reported to it.
     fn answer(&mut self, text: &str) -> Result<(), FoxgloveError> {
         match parse_request(text) {
             Ok(Request::Subscribe { subscriptions }) => {
@@ -224,7 +224,7 @@ impl Client {
         }
     }
 
-    /// Sends the last keyframe and graph on a channel that was just subscribed to.
+    /// Sends the last keyframe and graph on a newly subscribed channel.
     fn send_last(&mut self, channel: usize) -> Result<(), FoxgloveError> {
         let (socket, subscriptions) = (&mut self.socket, &self.subscriptions);
         let mut sink = ClientSink { socket, subscriptions, only: Some(channel) };

@@ -1,4 +1,4 @@
-//! Grey images as JPEG, both ways.
+//! Grey images to and from JPEG.
 
 use jpeg_encoder::{ColorType, Encoder};
 use zune_jpeg::JpegDecoder;
@@ -7,10 +7,10 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
-/// Why an image is not packed or unpacked.
+/// Why an image cannot be encoded or decoded.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum JpegError {
-    /// The size does not fit the pixels, or not into a JPEG.
+    /// The size does not match the pixels, or exceeds what a JPEG can hold.
     #[error("{width} × {height} is not the size of this image")]
     Size {
         /// Width in pixels.
@@ -18,12 +18,12 @@ pub enum JpegError {
         /// Height in pixels.
         height: usize,
     },
-    /// The encoder or decoder fails.
+    /// The encoder or decoder failed.
     #[error("JPEG: {0}")]
     Coding(String),
 }
 
-/// The JPEG of a grey image of `width` × `height` pixels; `quality` from 1 to 100.
+/// Encodes a grey image of `width` × `height` pixels as JPEG; `quality` from 1 to 100.
 pub fn encode_gray(
     pixels: &[u8],
     [width, height]: [usize; 2],
@@ -43,7 +43,7 @@ pub fn encode_gray(
     Ok(bytes)
 }
 
-/// The pixels of a JPEG that has this size: one of another size is refused before it takes memory.
+/// Decodes a JPEG of this size: one of another size is refused before memory is allocated for it.
 pub fn decode_gray(bytes: &[u8], [width, height]: [usize; 2]) -> Result<Vec<u8>, JpegError> {
     let wrong = JpegError::Size { width, height };
     let failed = |error: DecodeErrors| JpegError::Coding(error.to_string());
@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_image_comes_back_as_far_as_jpeg_keeps_it() {
+    fn an_image_survives_a_round_trip_within_the_loss_of_jpeg() {
         let size = [64, 48];
         let pixels: Vec<u8> = (0..64 * 48).map(|i| (i % 64 * 2 + i / 64) as u8).collect();
         let bytes = encode_gray(&pixels, size, 90).unwrap();
@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_sizes_and_broken_ones_are_refused() {
+    fn wrong_sizes_and_damaged_images_are_refused() {
         let bytes = encode_gray(&[7; 64 * 48], [64, 48], 90).unwrap();
         assert!(decode_gray(&bytes, [48, 64]).is_err());
         assert!(decode_gray(&bytes, [1 << 20, 1 << 20]).is_err());

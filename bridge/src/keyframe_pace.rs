@@ -1,17 +1,17 @@
-//! How often a keyframe is passed on: its depth is refined with nearly every frame, and a cloud of points is large.
+//! How often a keyframe is passed on: its depth is refined with nearly every frame, and point clouds are large.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use semidense::slam::keyframe::Keyframe;
 
-/// Shortest time between two revisions of the same keyframe.
+/// Minimum time between two revisions of the same keyframe.
 const PERIOD: Duration = Duration::from_secs(1);
 
-/// Passes on a new keyframe at once, then a revision a second, and its last one when the next keyframe comes.
+/// Passes on a new keyframe at once, then one revision a second, and its last one when the next keyframe arrives.
 #[derive(Debug, Default)]
 pub struct KeyframePace {
-    /// Which one was passed on last, and when.
+    /// Name and time of the last one passed on.
     passed: Option<(KeyframeName, Instant)>,
     waiting: Option<Arc<Keyframe>>,
 }
@@ -24,7 +24,7 @@ fn name(keyframe: &Keyframe) -> KeyframeName {
 }
 
 impl KeyframePace {
-    /// Takes a keyframe that came at `now` and gives those to pass on.
+    /// Takes a keyframe received at `now`; returns those to pass on.
     pub fn take(&mut self, keyframe: Arc<Keyframe>, now: Instant) -> Vec<Arc<Keyframe>> {
         let newest = name(&keyframe);
         let waited = self.waiting.take().filter(|waiting| name(waiting) != newest);
@@ -41,7 +41,7 @@ impl KeyframePace {
         ready
     }
 
-    /// What still waits: at the end.
+    /// The pending revision, for the end of the run.
     pub fn finish(&mut self) -> Option<Arc<Keyframe>> {
         self.waiting.take()
     }
@@ -61,7 +61,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_and_the_last_revision_are_passed_on_and_one_a_second_between() {
+    fn the_first_and_last_revision_are_passed_on_with_one_a_second_between() {
         let start = Instant::now();
         let mut pace = KeyframePace::default();
         let mut take = |millis: u64, id, revision| -> Vec<(u64, u64)> {

@@ -1,18 +1,18 @@
-//! What is done at most once in a period.
+//! Rate limit: an action done at most once per period.
 
 use std::time::{Duration, Instant};
 
-/// When something was done last; due at once where it never was.
+/// When something was last done; due at once if never.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct LastTime(Option<Instant>);
 
 impl LastTime {
-    /// Now.
+    /// Done now.
     pub fn now() -> Self {
         Self(Some(Instant::now()))
     }
 
-    /// Whether it is due once more; then it counts as done.
+    /// Whether the action is due again; if so, counts it as done.
     pub fn is_due(&mut self, period: Duration) -> bool {
         let is_due = self.0.is_none_or(|at| at.elapsed() >= period);
         if is_due {

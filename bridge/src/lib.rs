@@ -1,7 +1,7 @@
-//! Outputs of semidense beyond its shared memory: each is one more process that reads the topics like anybody else, and
-//! may be slow, die or be absent without the pipeline noticing.
+//! Outputs of semidense beyond its shared memory: each is a separate process that reads the topics like any
+//! other subscriber and may be slow, die or be absent without affecting the pipeline.
 //!
-//! [`session`] reads the topics of a running instance; every output is a folder beside it.
+//! [`session`] reads the topics of a running instance; every output is a module next to it.
 
 pub mod command;
 pub mod feed;

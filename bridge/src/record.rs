@@ -1,7 +1,7 @@
-//! Recordings: everything that a session reads, as ROS 2's messages in an MCAP file.
+//! Recordings: every event of a session, as ROS 2 messages in an MCAP file.
 //!
-//! [`recorder`] takes events and never waits; a thread of its own encodes and writes them. What comes faster than the
-//! disk takes it is dropped and counted.
+//! [`queue`] accepts events without waiting; [`recorder`] encodes and writes them on a separate thread.
+//! Events that arrive faster than the disk can write are dropped and counted.
 
 pub mod file;
 pub mod qos;

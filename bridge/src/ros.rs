@@ -1,7 +1,7 @@
-//! What semidense publishes, as ROS 2 messages: the same bytes for DDS, for recordings and for Foxglove.
+//! What semidense publishes, as ROS 2 messages: the same bytes for DDS, recordings and Foxglove.
 //!
-//! [`converter`] makes them of what a [`session`](crate::session) reads; [`axes`] is the one place where our axes
-//! become ROS's.
+//! [`converter`] makes them from the events of a [`session`](crate::session); [`axes`] is the only place
+//! where our axes are converted to those of ROS.
 
 pub mod axes;
 pub mod cdr;

@@ -1,7 +1,7 @@
-//! ROS 2 without ROS: a node of its own over DDS that publishes what semidense knows, and takes images in.
+//! ROS 2 without ROS: a DDS node that publishes the outputs of semidense and accepts images.
 //!
-//! [`network`] says how far it reaches, [`node`] is the node, [`publishing`] makes messages of what a session reads and
-//! [`outbox`] keeps a slow network from holding that up. [`camera`] is the other direction.
+//! [`network`] sets the reach of the node, [`node`] implements it, [`publishing`] makes messages from a session's
+//! events and [`outbox`] keeps a slow network from delaying that. [`camera`] is the other direction.
 
 pub mod camera;
 pub mod camera_rig;

@@ -1,3 +1,3 @@
-//! The reader of an instance's topics, which every output starts from.
+//! The reader of an instance's topics, on which every output is built.
 
 pub use semidense::reader::{Event, Frame, Graph, Pose, Session, SessionError, Wants};

@@ -1,11 +1,11 @@
-//! A bounded queue between two threads: one slot for each kind, in the order of their importance; where a slot is full, its
-//! oldest goes. Putting never waits.
+//! A bounded queue between two threads with one slot per kind of item, in order of importance; a full slot
+//! drops its oldest item. Putting never waits.
 
 use std::collections::VecDeque;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-/// The queue.
+/// A queue of prioritised, bounded slots.
 #[derive(Debug)]
 pub struct Slots<T> {
     inner: Mutex<Inner<T>>,
@@ -25,12 +25,12 @@ struct Slot<T> {
     dropped: u64,
 }
 
-/// Nothing more will come.
+/// The queue is closed: no more items will arrive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Closed;
 
 impl<T> Slots<T> {
-    /// A slot for each of `depths`: how many it holds.
+    /// A slot for each of `depths`, its capacity.
     pub fn new(depths: &[usize]) -> Self {
         let slot =
             |&depth: &usize| Slot { items: VecDeque::with_capacity(depth), depth, dropped: 0 };
@@ -38,7 +38,7 @@ impl<T> Slots<T> {
         Self { inner: Mutex::new(inner), filled: Condvar::new() }
     }
 
-    /// Puts an item into `slot`; the oldest of a full one is dropped and counted.
+    /// Puts an item into `slot`; if that is full, its oldest item is dropped and counted.
     pub fn put(&self, slot: usize, item: T) {
         let mut inner = self.lock();
         if let Some(slot) = inner.slots.get_mut(slot) {
@@ -52,12 +52,12 @@ impl<T> Slots<T> {
         self.filled.notify_one();
     }
 
-    /// The oldest item of the first slot that has one.
+    /// Takes the oldest item of the first non-empty slot.
     pub fn try_take(&self) -> Option<T> {
         self.lock().take()
     }
 
-    /// The same, waiting for one; `None` once the queue is closed.
+    /// Like [`Self::try_take`], but waits for an item; `None` once the queue is closed.
     pub fn take(&self) -> Option<T> {
         let mut inner = self.lock();
         loop {
@@ -71,7 +71,7 @@ impl<T> Slots<T> {
         }
     }
 
-    /// The same, waiting for at most `longest`; an error once the queue is closed and empty.
+    /// Waits for an item for at most `longest`; an error once the queue is closed and empty.
     pub fn take_within(&self, longest: Duration) -> Result<Option<T>, Closed> {
         let is_idle = |inner: &mut Inner<T>| {
             !inner.is_closed && inner.slots.iter().all(|slot| slot.items.is_empty())
@@ -84,19 +84,19 @@ impl<T> Slots<T> {
         }
     }
 
-    /// Ends every wait.
+    /// Closes the queue and ends every wait.
     pub fn close(&self) {
         self.lock().is_closed = true;
         self.filled.notify_all();
     }
 
-    /// How many were dropped in `slot`.
+    /// Number of items dropped from `slot`.
     pub fn dropped(&self, slot: usize) -> u64 {
         self.lock().slots.get(slot).map_or(0, |slot| slot.dropped)
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner<T>> {
-        // Every change is complete when the lock is given back.
+        // Every change is complete when the lock is released.
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -112,7 +112,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_oldest_goes_and_the_first_slot_comes_first() {
+    fn a_full_slot_drops_its_oldest_item_and_the_first_slot_has_priority() {
         let slots = Slots::new(&[2, 1]);
         (0..5).for_each(|item| slots.put(0, item));
         slots.put(1, 10);

@@ -1,7 +1,7 @@
-//! The live page and what else is served on its port: `/metrics`, the Foxglove WebSocket.
+//! The live page and everything else served on its port: `/metrics`, the Foxglove WebSocket.
 //!
-//! [`server`] takes connections and looks at their head ([`http`], [`guard`]); [`scene`] is what a page shows, kept up to
-//! date from the feed; [`stream`] sends it to one page; [`finished`] shows a run that is over.
+//! [`server`] accepts connections and checks their head ([`http`], [`guard`]); [`scene`] holds what a page
+//! shows, updated from the feed; [`stream`] sends it to one page; [`finished`] shows a finished run.
 
 pub mod finished;
 pub mod guard;

@@ -1,11 +1,11 @@
-//! A second machine: what an instance publishes goes over Zenoh, and back into shared memory at the other end, where every
-//! subscriber is the same program as on the robot.
+//! A second machine: the topics of an instance are sent over Zenoh and published in shared memory at the
+//! other end, where subscribers run unmodified.
 //!
-//! [`sender`] reads the topics of the local instance and puts them on Zenoh; [`receiver`] takes them there and publishes
-//! them through [`mirror`] under the name of an instance. [`envelope`] is what goes over the network.
+//! [`sender`] reads the topics of the local instance and publishes them on Zenoh; [`receiver`] receives them and
+//! publishes them through [`mirror`] under the name of an instance. [`envelope`] is the format on the network.
 //!
-//! Nothing of this is on the reading thread of the pipeline: queues are bounded, the newest wins, and what is dropped is
-//! counted.
+//! None of this runs on the pipeline's reading thread: queues are bounded, the newest item wins, and drops
+//! are counted.
 
 pub mod clock_offset;
 pub mod envelope;

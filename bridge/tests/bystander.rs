@@ -1,4 +1,4 @@
-//! A bridge that is stopped or killed changes nothing of the run that it reads: no result, and no frame waits for it.
+//! A stopped or killed bridge does not affect the run that it reads: no result changes, and no frame waits for it.
 #![cfg(feature = "zenoh")]
 
 mod support;
@@ -18,17 +18,17 @@ enum Fate {
     Killed,
 }
 
-/// Frames that are rendered while the bridge joins.
+/// Frames rendered while the bridge joins.
 const RENDERED: usize = 1500;
 
-/// A run on a small simulated camera beside a bridge; what it wrote into `output`.
+/// A run on a small simulated camera alongside a bridge; returns what it wrote to `output`.
 fn run(mode: &str, frames: usize, fate: Fate, read: impl Fn(&Path) -> String) -> String {
     let root = Root::new("bystander");
     let output = root.path().join("output");
     let bystander = (fate != Fate::Absent).then(|| {
         let mut command = Command::new(bridge());
         command.args(["--log", "info", "--instance", "bystander", "zenoh", "send", "--frames"]);
-        // Any free port: nobody comes.
+        // Any free port: nothing connects.
         command.args(["--listen", "tcp/127.0.0.1:0"]);
         Running::start(command, root.path())
     });
@@ -38,7 +38,7 @@ fn run(mode: &str, frames: usize, fate: Fate, read: impl Fn(&Path) -> String) ->
     for setting in ["width=160", "height=120", "focal_px=131.0", &format!("frames={RENDERED}")] {
         command.args(["--set", &format!("simulator.{setting}")]);
     }
-    // A debug build is slow, and not hung.
+    // A debug build is slow, but not hung.
     command.args(["--set", "supervisor.watchdog_s=100.0"]);
     if let Some(bystander) = &bystander {
         bystander.wait_for("sending instance");
@@ -67,7 +67,7 @@ fn a_stopped_and_a_killed_bridge_change_no_result_of_a_lockstep_run() {
 }
 
 #[test]
-fn a_live_run_beside_a_stopped_and_a_killed_bridge() {
+fn a_live_run_alongside_a_stopped_and_a_killed_bridge() {
     const FRAMES: usize = 150;
     let counts = |output: &Path| {
         let text = fs::read_to_string(output.join("summary.json")).unwrap();

@@ -1,4 +1,4 @@
-//! The Foxglove WebSocket protocol, by Foxglove's own client.
+//! The Foxglove WebSocket protocol, tested with Foxglove's own client.
 
 mod sample_run;
 mod support;
@@ -17,7 +17,7 @@ use support::{Process, Rig, has_tool, succeed, tools};
 use tungstenite::handshake::server::{Request, Response};
 
 #[test]
-fn foxgloves_own_client_gets_what_it_subscribes_to() {
+fn foxgloves_own_client_receives_what_it_subscribes_to() {
     if !has_client() {
         return;
     }
@@ -35,7 +35,7 @@ fn foxgloves_own_client_gets_what_it_subscribes_to() {
             let socket = tungstenite::accept_hdr(stream, answer).unwrap();
             let (sender, events) = sync_channel::<Event>(64);
             std::thread::spawn(move || {
-                // What comes once is there before anybody subscribes.
+                // One-off messages are sent before anything is subscribed to.
                 [Event::Joined, keyframe(1), graph()]
                     .into_iter()
                     .for_each(|e| sender.send(e).unwrap());
@@ -64,7 +64,7 @@ fn foxgloves_own_client_gets_what_it_subscribes_to() {
 }
 
 #[test]
-fn the_port_of_the_live_page_speaks_it() {
+fn the_port_of_the_live_page_accepts_foxglove_clients() {
     if !has_client() {
         return;
     }
@@ -78,12 +78,12 @@ fn the_port_of_the_live_page_speaks_it() {
     assert!(run.is_running());
 }
 
-/// Whether Foxglove's client is there, and the decoder of ROS 2's messages that Foxglove uses.
+/// Whether Foxglove's client and the decoder for ROS 2 messages that it uses are installed.
 fn has_client() -> bool {
     has_tool(&tools().join("node_modules/@foxglove/ws-protocol"))
 }
 
-/// What Foxglove's client finds at an address.
+/// What Foxglove's client receives at an address.
 fn run_client(address: &str, protocol: &str, instance: &str) -> Value {
     let mut client = Command::new("node");
     client.arg(script("foxglove_client.mjs")).args([address, protocol, instance]);
@@ -97,14 +97,14 @@ fn check(found: &Value, instance: &str) {
     assert_eq!(found["encodings"], json!(["cdr"]));
     let topics = found["topics"].as_array().unwrap();
     assert!(topics.len() >= 12, "{topics:?}");
-    // Every topic was subscribed to, and its messages decode by its schema.
+    // Every topic was subscribed to, and its messages decode with its schema.
     for topic in topics {
         assert!(found["counts"][topic.as_str().unwrap()].as_u64() > Some(0), "{topic}: {found}");
     }
     assert_eq!(found["odom"], json!(["odom", format!("{instance}_optical_frame")]));
     assert_eq!(found["imageFormat"], "jpeg");
     assert!(found["status"].as_str().unwrap().starts_with(instance), "{found}");
-    // Nothing more of what was unsubscribed from; a channel that is not there is a remark and not the end.
+    // Nothing arrives after unsubscribing; an unknown channel is a warning and does not end the connection.
     assert_eq!(found["afterUnsubscribe"], 0);
     assert!(found["warning"].as_str().unwrap().contains("there is no channel 999"), "{found}");
 }

@@ -1,4 +1,4 @@
-//! What a hostile or another version's program puts on the network is refused, and the next good message is used.
+//! Messages from a hostile program or another version are refused, and the next valid message is used.
 #![cfg(feature = "zenoh")]
 
 mod support;
@@ -28,7 +28,7 @@ fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
 }
 
-/// The network between the receiver of an instance and the program that attacks it.
+/// The network between the receiver of an instance and the attacking program.
 struct Attack {
     session: Session,
     poses: Subscriber<PoseMessage, ()>,
@@ -50,7 +50,7 @@ impl Attack {
         let connect = vec![endpoint.parse().unwrap()];
         let session = open(&Endpoints { connect, ..Endpoints::default() }).unwrap();
         let attack = Self { session, poses, health, receiver, _root: root };
-        // Until the link is there everything that is put goes nowhere.
+        // Until the link is up, everything sent is lost.
         let publisher = attack.session.declare_publisher(Kind::Frame.key("rig")).wait().unwrap();
         until("the link", || publisher.matching_status().wait().unwrap().matching().then_some(()));
         drop(publisher);
@@ -71,7 +71,7 @@ impl Attack {
         self.put(kind, seal(&ORIGIN, kind, number, message, payload));
     }
 
-    /// A pose that is right arrives, and none before it.
+    /// Checks that a valid pose arrives, and none before it.
     fn assert_works(&self, number: u64) {
         let mut pose = PoseMessage::new_zeroed();
         pose.sequence = 1_000_000 + number;
@@ -87,7 +87,7 @@ impl Attack {
 }
 
 #[test]
-fn broken_messages_are_refused_and_good_ones_still_arrive() {
+fn malformed_messages_are_refused_and_valid_ones_still_arrive() {
     let mut attack = Attack::begin();
     let payload =
         |bytes: Vec<u8>, unpacked_bytes, packing| Packed { packing, unpacked_bytes, bytes };
@@ -117,7 +117,7 @@ fn broken_messages_are_refused_and_good_ones_still_arrive() {
     let poses = payload(vec![0xFF; 80 * 3 + 1], 80 * 3 + 1, Packing::Plain);
     attack.put_message(Kind::Graph, 1, &GraphHeader::default(), &poses);
     attack.assert_works(10);
-    // Of a kind under another one's key, and of a program that nobody listens to.
+    // A message of another kind than its key, and one of a program that is not the current sender.
     attack
         .put(Kind::Pose, seal(&ORIGIN, Kind::Graph, 11, &GraphHeader::default(), &Packed::empty()));
     let other = Origin { sender: 8, ..ORIGIN };
@@ -133,14 +133,14 @@ fn another_wire_version_is_refused_with_both_named() {
     let presence = Presence { is_joined: 1, newest: [1; Kind::COUNT] };
     let mut bytes = seal(&ORIGIN, Kind::Presence, 0, &presence, &Packed::empty());
     bytes[size_of::<u32>()..2 * size_of::<u32>()].copy_from_slice(&other.to_le_bytes());
-    // What follows the version may be anything in that version.
+    // Whatever follows the version in that version.
     bytes.truncate(size_of::<Envelope>() - 8);
     let answer = move |query: zenoh::query::Query| {
         let _ = query.reply(query.key_expr().clone(), bytes.clone()).wait();
     };
     let key = Kind::Presence.key("rig");
     attack.session.declare_queryable(key).callback(answer).background().wait().unwrap();
-    let both = format!("the robot speaks wire version {other}, this program {WIRE_VERSION}");
+    let both = format!("the robot uses wire version {other}, this program {WIRE_VERSION}");
     until(&both, || {
         let health = attack.health.newest().unwrap()?.payload()[0];
         (health.state == ProcessState::Stale.code() && cause(&health).starts_with(&both))
@@ -150,7 +150,7 @@ fn another_wire_version_is_refused_with_both_named() {
 }
 
 #[test]
-fn who_does_not_know_the_password_is_refused() {
+fn peers_without_the_password_are_refused() {
     use std::os::unix::fs::PermissionsExt;
     let root = Root::new("far");
     let file = |name: &str, line: &str| {

@@ -1,4 +1,4 @@
-//! The live page as a browser, a scraper and an intruder see it, and as the run does: not at all.
+//! The live page as seen by a browser, a scraper and an intruder, and its absence of effect on the run.
 
 mod support;
 
@@ -9,18 +9,18 @@ use std::process::{Child, Command, Stdio};
 
 use support::{Process, Rig, ask, finish, get, has_tool, semidense, succeed, tools, until};
 
-/// A live run that goes on until it is ended: forty frames of the simulated camera back and forth.
+/// A live run that continues until it is ended: forty frames of the simulated camera back and forth.
 const LONG: &[&str] = &["--live", "--source", "loop:20000:10:sim"];
 const LONG_FRAMES: usize = 40;
 
-/// Where pictures are kept, to be looked at.
+/// Folder in which screenshots are kept for inspection.
 fn pictures() -> PathBuf {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/live-page");
     fs::create_dir_all(&folder).unwrap();
     folder
 }
 
-/// A script of `tests/browser` with its arguments; `None` where there is no browser.
+/// A script of `tests/browser` with its arguments; `None` if there is no browser.
 fn browser(script: &str, arguments: &[&str]) -> Option<Command> {
     let chromium =
         std::env::var_os("CHROMIUM").map_or(PathBuf::from("/usr/bin/chromium"), PathBuf::from);
@@ -37,7 +37,7 @@ fn browser(script: &str, arguments: &[&str]) -> Option<Command> {
     Some(command)
 }
 
-/// The script of a browser that is led step by step.
+/// A browser script driven step by step.
 struct Led {
     child: Child,
     output: BufReader<std::process::ChildStdout>,
@@ -50,7 +50,7 @@ impl Led {
         Self { child, output }
     }
 
-    /// Reads until it has come to a step, and gives what it said before.
+    /// Reads until it has reached a step; returns its output up to there.
     fn comes_to(&mut self, step: &str) -> String {
         let mut said = String::new();
         loop {
@@ -79,7 +79,7 @@ impl Drop for Led {
 }
 
 #[test]
-fn a_browser_sees_a_run_from_before_its_beginning_to_the_next() {
+fn a_browser_shows_a_run_from_before_its_start_to_the_next_run() {
     let rig = Rig::new();
     let (view, address) = rig.view(&["--maps", "maps"]);
     let Some(command) = browser("live.mjs", &[&address]) else { return };
@@ -110,7 +110,7 @@ fn a_browser_sees_a_run_from_before_its_beginning_to_the_next() {
 }
 
 #[test]
-fn a_browser_sees_a_finished_run_and_its_report() {
+fn a_browser_shows_a_finished_run_and_its_report() {
     let rig = Rig::new();
     succeed(rig.run(60, &[]));
     let (_view, address) = rig.view(&[rig.output().to_str().unwrap()]);
@@ -122,7 +122,7 @@ fn a_browser_sees_a_finished_run_and_its_report() {
 }
 
 #[test]
-fn a_folder_that_is_no_run_is_refused_with_what_to_do() {
+fn a_folder_without_a_run_is_refused_with_advice() {
     let rig = Rig::new();
     let output = finish(rig.bridge(&["view", "nowhere", "--listen", "127.0.0.1:0"]));
     let error = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -141,7 +141,7 @@ fn prometheus_reads_the_metrics() {
             .iter()
             .all(|p| text.contains(&format!("semidense_frames_total{{process=\"{p}\"}}")))
     };
-    // Poses are counted as they come, the rest is what a process said last: either may be ahead.
+    // Poses are counted as they arrive, the rest is from the last report of a process: either may be ahead.
     let counted = |text: &str, figure: &str| {
         text.contains(&format!("{figure} ")) && !text.contains(&format!("{figure} 0\n"))
     };
@@ -199,7 +199,7 @@ fn intruders_are_refused() {
 }
 
 #[test]
-fn who_listens_to_everybody_gets_a_token() {
+fn a_server_open_to_other_machines_gets_a_token() {
     let rig = Rig::new();
     let mut view = Process::start(rig.bridge(&["view", "--listen", "0.0.0.0:0"]));
     let address = view.line();
@@ -228,18 +228,18 @@ fn who_listens_to_everybody_gets_a_token() {
     BufReader::new(child.stderr.take().unwrap()).read_line(&mut warning).unwrap();
     let _ = child.kill();
     let _ = child.wait();
-    assert!(warning.starts_with("warning: everybody who reaches"), "{warning}");
+    assert!(warning.starts_with("warning: anyone who can reach"), "{warning}");
 }
 
-/// What a run has computed.
+/// The results of a run.
 fn trajectories(rig: &Rig) -> [Vec<u8>; 3] {
     ["trajectory.txt", "trajectory_online.txt", "keyframes.txt"]
         .map(|name| fs::read(rig.output().join(name)).unwrap())
 }
 
 #[test]
-fn a_page_that_is_stopped_or_killed_changes_no_result() {
-    /// Rendered while the page joins; the run begins with the first sixty.
+fn a_stopped_or_killed_page_changes_no_result() {
+    /// Rendered while the page joins; the run starts with the first sixty.
     const FRAMES: usize = 1500;
     let arguments = ["--lockstep", "--source", "loop:60:30:sim"];
     let alone = Rig::new();
@@ -279,11 +279,11 @@ fn a_run_serves_its_page_and_outlives_it() {
     let status = run.wait().unwrap();
     let rest = rest.join().unwrap();
     assert!(status.success(), "{rest}");
-    assert!(rest.contains("the live page has ended"), "{rest}");
+    assert!(rest.contains("the live page exited"), "{rest}");
     assert_eq!(child_of(run.id(), "view"), None);
 }
 
-/// The child of a process whose command line has a word.
+/// The child of a process whose command line contains a word.
 fn child_of(parent: u32, word: &str) -> Option<u32> {
     let processes = fs::read_dir("/proc").unwrap().flatten();
     let ids = processes.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok());

@@ -1,4 +1,4 @@
-//! A live run is recorded, and computed again from the recording: the poses are those that the recorded frames give.
+//! A live run is recorded and replayed from the recording: the poses equal those computed from the recorded frames.
 
 mod support;
 
@@ -10,11 +10,11 @@ use semidense::capture::opening::{SourceParams, open};
 use semidense::capture::source_name::SourceName;
 use support::{Process, Rig, semidense, succeed, until};
 
-/// Frames of the run, and how fast they come: slow enough for a busy machine without an optimised build.
+/// Frames of the run, and their rate: slow enough for a busy machine and an unoptimised build.
 const FRAMES: usize = 40;
 const RATE_HZ: usize = 4;
 
-/// Writes the frames of a recording as a folder of images; gives how many there are.
+/// Writes the frames of a recording to a folder of images; returns their number.
 fn write_images(recording: &Path, folder: &Path) -> usize {
     let name = SourceName::Mcap { file: recording.to_owned(), topic: None };
     let mut source = open(&name, None, &SourceParams::default()).unwrap();
@@ -47,7 +47,7 @@ fn replay(source: &str, output: &Path) -> [Vec<u8>; 2] {
 }
 
 #[test]
-fn a_recorded_live_run_gives_the_poses_of_its_frames() {
+fn replaying_a_recorded_live_run_gives_the_poses_of_its_frames() {
     let rig = Rig::new();
     let at = |name: &str| rig.folder().join(name);
     let recording = at("run.mcap");

@@ -1,4 +1,4 @@
-//! Recordings, by readers that are not ours; bags, by writers that are not ours; and what a kill leaves.
+//! Recordings read by independent readers, bags by independent writers, and what a kill leaves.
 
 mod sample_run;
 mod support;
@@ -41,8 +41,8 @@ fn record(params: RecordParams, events: Vec<Event>) -> RecordSummary {
     recorder.run(&receiver).unwrap()
 }
 
-/// Runs a script with the readers and writers of PyPI (the reference implementation, its decoder for ROS 2, and
-/// Ternaris' own of both) and gives what it printed; `None` where they are not installed.
+/// Runs a script with readers and writers from PyPI (the reference implementation, its decoder for ROS 2, and
+/// Ternaris' implementation of both) and returns its output; `None` if they are not installed.
 fn run_python(name: &str, argument: &Path) -> Option<String> {
     if !has_tool(&tools().join("python-recordings")) {
         return None;
@@ -88,7 +88,7 @@ fn independent_readers_find_what_was_recorded() {
         ("/left/details/keyframe", 1),
         ("/left/keyframes", 1),
         ("/left/details/graph", 1),
-        // Three processes, and recording itself with capture's.
+        // Three processes, and with each report of capture one of the recording itself.
         ("/diagnostics", 2 * 4),
     ] {
         assert_eq!(found["counts"][topic], count, "{topic}");
@@ -123,7 +123,7 @@ fn independent_readers_find_what_was_recorded() {
 }
 
 #[test]
-fn a_recording_plays_the_same_frames_again() {
+fn a_recording_replays_the_same_frames() {
     let folder = tempfile::tempdir().unwrap();
     for (images, is_exact) in
         [(ImageFormat::Png, true), (ImageFormat::Raw, true), (ImageFormat::Jpeg, false)]
@@ -149,7 +149,7 @@ fn a_recording_plays_the_same_frames_again() {
 }
 
 #[test]
-fn bags_of_other_writers_are_played() {
+fn bags_of_independent_writers_are_replayed() {
     let folder = tempfile::tempdir().unwrap();
     let Some(_) = run_python("write_bag.py", folder.path()) else { return };
     let rosbags = std::fs::read_dir(folder.path().join("rosbags")).unwrap();
@@ -172,7 +172,7 @@ fn bags_of_other_writers_are_played() {
 }
 
 #[test]
-fn files_are_split_and_each_is_whole() {
+fn a_recording_is_split_into_complete_files() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run.mcap");
     let max_bytes = Some(50_000);
@@ -185,7 +185,7 @@ fn files_are_split_and_each_is_whole() {
 }
 
 #[test]
-fn a_file_that_exists_is_not_touched() {
+fn an_existing_file_is_left_untouched() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run.mcap");
     std::fs::write(&path, "mine").unwrap();
@@ -194,7 +194,7 @@ fn a_file_that_exists_is_not_touched() {
     assert_eq!(std::fs::read(&path).unwrap(), b"mine");
 }
 
-/// The environment's name for the file that [`writes_until_it_is_killed`] writes.
+/// Environment variable with the file that [`writes_until_it_is_killed`] writes.
 const KILLED_FILE: &str = "SEMIDENSE_TEST_KILLED_FILE";
 
 #[test]
@@ -223,7 +223,7 @@ fn a_kill_leaves_all_but_the_last_second() {
         .stdout(Stdio::null())
         .spawn()
         .unwrap();
-    // Until the file has grown three times: its beginning and two chunks.
+    // Until the file has grown three times: by its header and two chunks.
     let length = || std::fs::metadata(&path).map_or(0, |file| file.len());
     let (began, mut last, mut growths) = (Instant::now(), 0, 0);
     while growths < 3 {
@@ -241,7 +241,7 @@ fn a_kill_leaves_all_but_the_last_second() {
     if let Some(theirs) = run_python("read_truncated.py", &path) {
         assert_eq!(theirs.trim(), ours.to_string());
     }
-    // Cut within its last chunk, it is still read to the one before.
+    // Cut within its last chunk, it can still be read up to the previous one.
     let bytes = std::fs::read(&path).unwrap();
     let cut = folder.path().join("cut.mcap");
     std::fs::write(&cut, &bytes[..bytes.len() / 10 * 9]).unwrap();
@@ -250,14 +250,14 @@ fn a_kill_leaves_all_but_the_last_second() {
 }
 
 #[test]
-fn a_queue_that_nobody_empties_drops_and_counts_and_does_not_wait() {
+fn a_full_queue_drops_and_counts_without_waiting() {
     let (sender, receiver) = queue(10 * (WIDTH * HEIGHT) as u64);
     (0..50).for_each(|sequence| assert!(sender.put(Moment::now(), frame(sequence))));
     let counts = sender.counts.clone();
     assert_eq!(counts.dropped_images.load(std::sync::atomic::Ordering::Relaxed), 40);
     sender.put(Moment::now(), health("capture"));
     assert_eq!(counts.dropped(), 41, "there is no room for small ones either");
-    // Room again once something is taken.
+    // There is room again once something is taken.
     assert!(receiver.take().is_some());
     sender.put(Moment::now(), frame(50));
     assert_eq!(counts.dropped(), 41);

@@ -1,5 +1,5 @@
-//! ROS 2 against another DDS implementation, Eclipse's, in Python: what it reads is what shared memory has, and what it
-//! publishes is tracked. Nothing leaves the machine: as root all of it is in a network namespace of its own.
+//! ROS 2 against another DDS implementation, Eclipse Cyclone, in Python: it reads what shared memory contains, and
+//! what it publishes is tracked. Nothing leaves the machine: as root, all of it runs in a separate network namespace.
 #![cfg(feature = "ros2")]
 
 mod support;
@@ -29,14 +29,14 @@ const CYCLONE: &str = "<CycloneDDS><Domain Id='any'><General><Interfaces><Networ
 /// Poses that the reader waits for.
 const NUM_POSES: usize = 40;
 
-/// A place for a test: a namespace of the network where that is allowed, and a domain.
+/// Environment of a test: a network namespace, where that is allowed, and a domain.
 struct Dds {
     network: Option<Network>,
     domain: String,
 }
 
 impl Dds {
-    /// `None` where the other implementation is not installed, which is said; in CI it must be.
+    /// `None` if the other implementation is not installed, which is printed; in CI it must be installed.
     fn new(domain: u16) -> Option<Self> {
         if !has_tool(&python()) || !has_tool(&python().with_file_name("cyclonedds")) {
             return None;
@@ -88,14 +88,14 @@ fn assert_near(found: &SE3, expected: &SE3) {
     assert!(moved < 1e-9 && turned < 1e-7, "{found:?} is not {expected:?}");
 }
 
-/// A camera at `position` in our axes, not turned, in ROS's: x forward, y left, z up.
+/// A camera at `position` in our axes, without rotation, in ROS's: x forward, y left, z up.
 fn in_ros(position: &[f64]) -> SE3 {
     let rotation = UnitQuaternion::from_quaternion(Quaternion::new(0.5, -0.5, 0.5, -0.5));
     SE3 { rotation, translation: Vector3::new(position[2], -position[0], -position[1]) }
 }
 
 #[test]
-fn another_implementation_reads_what_shared_memory_has() {
+fn another_implementation_reads_what_shared_memory_contains() {
     let Some(dds) = Dds::new(71) else { return };
     let root = Root::new("front");
     let robot = Robot::start(&root.place(), 5);
@@ -104,7 +104,7 @@ fn another_implementation_reads_what_shared_memory_has() {
     let mut publisher = Running::start(publisher, root.path());
     publisher
         .wait_for("publishing front on ROS 2, topics below /front, domain 71, this machine only");
-    // Late, as rviz: what was said once must still come.
+    // Late, as rviz: earlier one-off messages must still arrive.
     until("poses", || (robot.last_sequence() > 60).then_some(()));
     let folder = root.path().to_str().unwrap();
     let mut peer = Running::start(
@@ -119,7 +119,7 @@ fn another_implementation_reads_what_shared_memory_has() {
     check_poses(&came, &robot);
     check_transforms(&came);
     check_bytes(&came, root.path());
-    // The names by which ROS shows it; best effort and reliable subscribers of poses are both served.
+    // The names by which ROS lists it; best-effort and reliable subscribers of poses are both served.
     let nodes = came["nodes"].as_array().unwrap();
     assert!(
         nodes.iter().any(|node| node[0] == "/front"
@@ -127,9 +127,9 @@ fn another_implementation_reads_what_shared_memory_has() {
             && node[2].as_u64() > Some(8))
     );
     assert!(came["odometry_best_effort"].as_array().unwrap().len() > NUM_POSES / 2);
-    // Clouds are best effort: who wants them reliable gets none, and is named.
+    // Clouds are best effort: a subscriber that requires reliability receives none, and is reported.
     assert_eq!(came["counts"]["cloud_reliable"], 0);
-    publisher.wait_for("/front/points wants it reliable");
+    publisher.wait_for("/front/points requests reliable delivery");
     let reports: Vec<&str> = came["diagnostics"]
         .as_array()
         .unwrap()
@@ -142,7 +142,7 @@ fn another_implementation_reads_what_shared_memory_has() {
     assert!(publisher.interrupt(), "{}", publisher.said());
 }
 
-/// Each pose that came is one that was sent, to the last digit but two.
+/// Checks that each received pose is one that was sent, except for its last two digits.
 fn check_poses(came: &Value, robot: &Robot) {
     let odometry = came["odometry"].as_array().unwrap();
     assert!(odometry.len() >= NUM_POSES);
@@ -159,7 +159,7 @@ fn check_poses(came: &Value, robot: &Robot) {
         let sent = robot.sent(|sent| sent.poses.values().map(|(pose, _)| *pose).find(is_it));
         let sent = sent.unwrap_or_else(|| panic!("{message} was never sent"));
         assert_near(&found, &in_ros(&sent.world_from_camera[4..]));
-        // The first of the covariance is along x forward, our z.
+        // The first covariance entry is along x forward, our z.
         let covariance = numbers(&message["covariance"]);
         assert!((covariance[0] - sent.covariance[11]).abs() < 1e-9, "{covariance:?}");
         // Velocities are in the child's axes, which are the camera's own.
@@ -184,7 +184,7 @@ fn check_poses(came: &Value, robot: &Robot) {
     assert!(stamps.windows(2).all(|pair| pair[0] < pair[1]), "in order, none twice");
 }
 
-/// map → odom → camera is the pose in the map, and the camera's body is in its optical frame.
+/// Checks that map → odom → camera is the pose in the map, and that the camera's body is in its optical frame.
 fn check_transforms(came: &Value) {
     let mut matched = 0;
     for message in came["tf"].as_array().unwrap() {
@@ -217,7 +217,7 @@ fn check_transforms(came: &Value) {
     assert!((forward - Vector3::z()).norm() < 1e-12);
 }
 
-/// Cloud, image and camera, byte by byte.
+/// Compares cloud, image and camera byte by byte.
 fn check_bytes(came: &Value, folder: &Path) {
     let cloud = std::fs::read(folder.join("cloud.bin")).unwrap();
     assert!(cloud.len() >= 960_000 && cloud.len() == POINTS * 20, "{} bytes", cloud.len());
@@ -246,7 +246,7 @@ fn check_bytes(came: &Value, folder: &Path) {
     );
 }
 
-/// Frames of a simulated camera in a file.
+/// Writes frames of a simulated camera to a file.
 fn write_frames(file: &Path, frames: usize) {
     let params = SimulatorParams {
         frames,
@@ -279,7 +279,7 @@ fn process_with(word: &str) -> Option<i32> {
 }
 
 #[test]
-fn images_of_another_implementation_are_tracked_and_a_killed_bridge_comes_back() {
+fn images_of_another_implementation_are_tracked_and_a_killed_bridge_is_restarted() {
     let Some(dds) = Dds::new(72) else { return };
     let root = Root::new("semidense");
     let file = root.path().join("frames.raw");
@@ -289,16 +289,16 @@ fn images_of_another_implementation_are_tracked_and_a_killed_bridge_comes_back()
     let mut camera = dds.peer("camera.py", &["72", &topic, file.to_str().unwrap()]);
     camera.args(numbers).stdin(Stdio::piped());
     let mut camera = Camera(camera.spawn().unwrap());
-    // No rig: that of the CameraInfo.
+    // No rig file: the calibration is from the CameraInfo.
     let output = root.path().join("output");
     let mut run = dds.command(&semidense());
     run.args(["run", &format!("ros2:{topic}"), "--output", output.to_str().unwrap()]);
-    // A start of the map takes seconds where nothing is optimised.
+    // A start of the map takes seconds without optimisation.
     run.args(["--set", "supervisor.watchdog_s=0"]);
     let mut run = Running::start(run, root.path());
     let mut session = Session::new(root.place(), "probe", Wants::default());
     let tracked = count_tracked(&mut session, 40);
-    // No frame comes without it; capture says so, and starts another.
+    // No frame arrives without the bridge; capture reports that, and starts another one.
     let id = until("the bridge", || process_with(&topic));
     let killed = Command::new("kill").args(["-s", "KILL", &id.to_string()]).status().unwrap();
     assert!(killed.success());
@@ -314,7 +314,7 @@ fn images_of_another_implementation_are_tracked_and_a_killed_bridge_comes_back()
     let again = count_tracked(&mut session, 20);
     assert!(again > tracked, "numbers go on: {again} after {tracked}");
     assert_ne!(process_with(&topic), Some(id));
-    // A run that is interrupted exits with 130; its results say how it went.
+    // An interrupted run exits with 130; its results tell how it went.
     run.interrupt();
     assert!(camera.0.try_wait().unwrap().is_none(), "the camera has ended early");
     let rig = std::fs::read_to_string(output.join("rig.toml")).unwrap();
@@ -339,10 +339,10 @@ fn read(session: &mut Session, take: impl FnMut(Event)) {
     session.read(None, std::time::Duration::from_millis(50), take).unwrap();
 }
 
-/// Where nothing is optimised the start of a map takes longer than a test may: poses are enough there.
+/// Without optimisation the start of a map takes longer than a test may: poses are enough then.
 const IS_SLOW: bool = cfg!(debug_assertions);
 
-/// Waits for so many tracked poses; the sequence of the last.
+/// Waits for this many tracked poses; returns the sequence of the last.
 fn count_tracked(session: &mut Session, count: usize) -> u64 {
     let (mut tracked, mut last) = (0, 0);
     until("tracked poses", || {

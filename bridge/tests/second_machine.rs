@@ -1,4 +1,4 @@
-//! An instance on a second machine: between network namespaces, which are machines as far as the network can tell.
+//! An instance on a second machine: in network namespaces, which to the network are separate machines.
 #![cfg(feature = "zenoh")]
 
 mod support;
@@ -34,7 +34,7 @@ fn receive(mut command: Command, root: &Root, from: &str, arguments: &[&str]) ->
     Running::start(command, root.path())
 }
 
-/// Poses at the other end, with the instant at which each was seen.
+/// Poses at the other end, with the time at which each was seen.
 struct Probe {
     poses: Subscriber<PoseMessage, ()>,
     health: Subscriber<HealthMessage, ()>,
@@ -45,7 +45,7 @@ struct Probe {
 impl Probe {
     fn open(root: &Root) -> Self {
         let hub = root.observe();
-        // Its topics come one after the other.
+        // Its topics appear one after another.
         let poses = until("poses", || hub.subscriber(&POSE).ok());
         let health = until("health", || hub.subscriber(&TRACKER_HEALTH).ok());
         Self { poses, health, last_health: None, hub }
@@ -60,7 +60,7 @@ impl Probe {
     fn wait_for(&self, count: usize, sequence: u64) -> Vec<(PoseMessage, i64)> {
         let mut taken = Vec::new();
         until("poses at the other end", || {
-            // Awake when a pose comes: what is measured is its way, not this loop.
+            // Awake when a pose arrives: the latency of transport is measured, not of this loop.
             let end = Instant::now() + Duration::from_secs(1);
             while taken.len() < count && Instant::now() < end {
                 wait(&[self.poses.events()], None, Duration::from_millis(100)).unwrap();
@@ -71,7 +71,7 @@ impl Probe {
         taken
     }
 
-    /// Waits for a state of the tracker's health; its cause.
+    /// Waits for a state of the tracker's health; returns its cause.
     fn wait_for_state(&mut self, state: ProcessState) -> String {
         until(&format!("health to be {}", state.name()), || {
             while let Some(message) = self.health.receive().unwrap() {
@@ -82,7 +82,7 @@ impl Probe {
     }
 }
 
-/// Every field but the clock's equals what was sent; the clock's is translated.
+/// Checks that every field equals what was sent, but that stamps of the sender's clock are converted.
 fn assert_unchanged(robot: &Robot, arrived: &[(PoseMessage, i64)], shift_nanos: i64) {
     for (pose, _) in arrived {
         let (sent, at) = robot.sent(|sent| sent.poses[&pose.sequence]);
@@ -100,19 +100,19 @@ fn added_ms(robot: &Robot, arrived: &[(PoseMessage, i64)]) -> [f64; 2] {
 }
 
 #[test]
-fn everything_arrives_unchanged_and_goes_on_after_a_cut_and_behind_a_slow_subscriber() {
+fn messages_arrive_unchanged_and_resume_after_a_cut_and_behind_a_slow_subscriber() {
     let Some(network) = Network::new(1) else { return };
     let (near, far) = (Root::new("rig"), Root::new("far"));
     let port = format!("tcp/{}:7447", robot_address(0));
-    // The other way round than one starts them: each waits for the one before.
+    // In reverse of the usual order: each waits for the one before.
     let mut receiver = receive(network.on_host(bridge()), &far, "rig", &["--connect", &port]);
     let mut probe = Probe::open(&far);
     let waiting = probe.wait_for_state(ProcessState::Stale);
-    assert!(waiting.contains("no word of `rig`") && waiting.contains(&port), "{waiting}");
+    assert!(waiting.contains("no messages of `rig`") && waiting.contains(&port), "{waiting}");
     let options = ["--listen", &port, "--frames", "--frame-rate", "100", "--jpeg-quality", "95"];
     let mut sender = send(network.on_robot(0, bridge()), &near, &options);
     until("the sender to be seen", || {
-        probe.wait_for_state(ProcessState::Stale).contains("does not run").then_some(())
+        probe.wait_for_state(ProcessState::Stale).contains("is not running").then_some(())
     });
     let robot = Robot::start(&near.place(), 1);
     let first = probe.wait_for(1, 0)[0].0.sequence;
@@ -135,7 +135,7 @@ fn everything_arrives_unchanged_and_goes_on_after_a_cut_and_behind_a_slow_subscr
     over_a_cut(&network, &mut probe, &robot);
 
     assert!(sender.interrupt(), "{}", sender.said());
-    assert!(probe.wait_for_state(ProcessState::Stale).contains("no word"));
+    assert!(probe.wait_for_state(ProcessState::Stale).contains("no messages"));
     assert!(receiver.interrupt(), "{}", receiver.said());
 }
 
@@ -159,7 +159,7 @@ fn assert_map_and_frames_arrive(hub: &Hub, robot: &Robot) {
     assert!(worst.is_some_and(|worst| worst < 16), "a JPEG that is {worst:?} grey levels off");
 }
 
-/// One that reads all topics at the other end and is stopped.
+/// A stopped subscriber at the other end that subscribes to all topics.
 fn behind_a_stopped_subscriber(network: &Network, far: &Root, probe: &Probe, robot: &Robot) {
     let slow =
         send(network.on_host(bridge()), far, &["--listen", "tcp/127.0.0.1:7448", "--frames"]);
@@ -189,7 +189,7 @@ fn over_a_cut(network: &Network, probe: &mut Probe, robot: &Robot) {
         (arrived.last().unwrap().0.sequence > restored + 30).then_some(())
     });
     assert_unchanged(robot, &arrived, 0);
-    // A stale pose is known by its stamp, without knowing of the cut.
+    // A stale pose is recognised by its stamp, without knowledge of the cut.
     let age = |(pose, at): &(PoseMessage, i64)| at - pose.published_nanos;
     let stale = arrived.iter().filter(|(pose, at)| pose.sequence <= restored && *at > instant);
     let [oldest, count] = [stale.clone().map(age).max().unwrap_or(0), stale.count() as i64];
@@ -203,7 +203,7 @@ fn over_a_cut(network: &Network, probe: &mut Probe, robot: &Robot) {
 }
 
 #[test]
-fn four_robots_to_one_host() {
+fn four_robots_send_to_one_host() {
     let Some(network) = Network::new(4) else { return };
     let near: Vec<Root> = (0..4).map(|_| Root::new("semidense")).collect();
     let far: Vec<Root> = (0..4).map(|robot| Root::new(&format!("robot{robot}"))).collect();
@@ -226,7 +226,7 @@ fn four_robots_to_one_host() {
         let [p50, p99] = added_ms(robot, &arrived);
         eprintln!("robot {number} of 4: added {p50:.2} ms median, {p99:.2} ms p99");
     }
-    // Nobody else can speak as one of them.
+    // No other receiver can publish as one of them.
     let options = ["--connect", &port(1)];
     let mut second = receive(network.on_host(bridge()), &far[0], "semidense", &options);
     assert!(!second.end());
@@ -236,7 +236,7 @@ fn four_robots_to_one_host() {
 }
 
 #[test]
-fn stamps_are_translated_to_a_clock_that_started_at_another_time() {
+fn stamps_are_converted_to_a_clock_that_started_at_another_time() {
     /// How far the receiver's clock is ahead of the robot's, seconds: more than a day.
     const AHEAD_SECS: i64 = 100_000;
     let Some(network) = Network::new(1) else { return };

@@ -27,11 +27,11 @@
 // The id of no keyframe: before the first.
 #define SEMIDENSE_NO_KEYFRAME UINT64_MAX
 
-// How a call ended: 0 and above are no errors.
+// Outcome of a call: 0 and above are not errors.
 typedef enum semidense_status {
   // Done.
   SEMIDENSE_STATUS_OK = 0,
-  // Nothing new: everything has been read, or the time is over.
+  // Nothing new: everything has been read, or the timeout has passed.
   SEMIDENSE_STATUS_NONE = 1,
   // The run has ended and everything has been read: close the reader.
   SEMIDENSE_STATUS_ENDED = 2,
@@ -39,25 +39,25 @@ typedef enum semidense_status {
   SEMIDENSE_STATUS_ERROR_ARGUMENT = -1,
   // The reader is closed, or was opened by another thread.
   SEMIDENSE_STATUS_ERROR_HANDLE = -2,
-  // No instance of this name runs here.
+  // No instance of this name is running here.
   SEMIDENSE_STATUS_ERROR_NOT_RUNNING = -3,
-  // The instance speaks another wire version than this library.
+  // The instance uses another wire version than this library.
   SEMIDENSE_STATUS_ERROR_WIRE_VERSION = -4,
-  // Shared memory cannot be used: another user's, full, or a limit.
+  // Shared memory cannot be used: it belongs to another user, is full, or a limit is reached.
   SEMIDENSE_STATUS_ERROR_TRANSPORT = -5,
   // The reader was not opened for this kind of message.
   SEMIDENSE_STATUS_ERROR_NOT_WANTED = -6,
-  // A fault of this library.
+  // A defect of this library.
   SEMIDENSE_STATUS_ERROR_INTERNAL = -7,
 } semidense_status;
 
 // Tracking status of a frame.
 typedef enum semidense_state {
-  // No map that can be trusted yet; the pose is a working value.
+  // There is no reliable map yet; the pose is provisional.
   SEMIDENSE_STATE_INITIALIZING = 0,
-  // The pose is good to its covariance.
+  // The pose is accurate to its covariance.
   SEMIDENSE_STATE_TRACKING = 1,
-  // The pose is usable, but worse than it should be: see the reason.
+  // The pose is usable, but less accurate than usual: see the reason.
   SEMIDENSE_STATE_DEGRADED = 2,
   // The pose is not claimed: see the reason.
   SEMIDENSE_STATE_LOST = 3,
@@ -65,17 +65,17 @@ typedef enum semidense_state {
 
 // Why a pose is degraded or lost.
 typedef enum semidense_reason {
-  // It is neither.
+  // Neither degraded nor lost.
   SEMIDENSE_REASON_NONE = 0,
-  // Degraded: the deadline came before the finest level was solved.
+  // Degraded: the deadline passed before the finest level was solved.
   SEMIDENSE_REASON_BUDGET = 1,
   // Degraded: few of the keyframe's points are in view.
   SEMIDENSE_REASON_LOW_OVERLAP = 2,
   // Degraded: the residuals are larger than noise and depth variance explain.
   SEMIDENSE_REASON_HIGH_RESIDUAL = 3,
-  // Degraded: frames are missing between this one and the one before.
+  // Degraded: frames are missing between this one and the previous one.
   SEMIDENSE_REASON_GAP = 4,
-  // Degraded: the known depth is out of view; the rotation holds, the position stands still.
+  // Degraded: the known depth is out of view; the rotation is valid, the position is held.
   SEMIDENSE_REASON_TURNING = 5,
   // Lost: the iteration left the image or became non-finite.
   SEMIDENSE_REASON_DIVERGED = 6,
@@ -83,13 +83,13 @@ typedef enum semidense_reason {
   SEMIDENSE_REASON_TOO_FEW_INLIERS = 7,
   // Lost: the keyframe has no usable points.
   SEMIDENSE_REASON_NO_POINTS = 8,
-  // Lost: the frame has another size than the keyframe, or no contrast at all.
+  // Lost: the frame differs in size from the keyframe, or has no contrast at all.
   SEMIDENSE_REASON_UNUSABLE_FRAME = 9,
   // Lost: the mapper found the map inconsistent.
   SEMIDENSE_REASON_MAP_REJECTED = 10,
 } semidense_reason;
 
-// An open reader: closed by `semidense_close`, used by the thread that opened it alone.
+// An open reader: closed by `semidense_close`, used only by the thread that opened it.
 typedef struct semidense_reader semidense_reader;
 
 // `x' = scale · R x + t`; the scale of a rigid transform is 1.
@@ -102,53 +102,53 @@ typedef struct semidense_transform {
   double scale;
 } semidense_transform;
 
-// The pose of one frame; every frame has one, also when the camera is lost.
+// The pose of one frame; every frame has one, even when the camera is lost.
 typedef struct semidense_pose {
-  // Number of the frame at its source; a gap is a frame that is missing.
+  // Number of the frame at its source; a gap is a missing frame.
   uint64_t sequence;
   // Middle of the exposure, nanoseconds: CLOCK_MONOTONIC of a camera, else the recording's clock.
   int64_t capture_nanos;
-  // CLOCK_REALTIME of the frame, nanoseconds since 1970; 0 where unknown.
+  // CLOCK_REALTIME of the frame, nanoseconds since 1970; 0 if unknown.
   int64_t realtime_nanos;
   // CLOCK_MONOTONIC when the pose was published.
   int64_t published_nanos;
-  // From the frame to the publication of its pose.
+  // Time from the frame to the publication of its pose.
   uint64_t latency_nanos;
-  // Keyframe it was tracked on, all ones before the first.
+  // Keyframe it was tracked on; all ones before the first.
   uint64_t keyframe_id;
   // Revision of that keyframe.
   uint64_t keyframe_revision;
-  // How often the map had been corrected: `map_from_camera` may jump where it grows.
+  // Number of corrections of the map: `map_from_camera` may jump when it increases.
   uint64_t map_revision;
-  // Life of the map.
+  // Epoch of the map.
   uint32_t epoch;
   // Tracking status.
   enum semidense_state state;
   // Why it is degraded or lost.
   enum semidense_reason reason;
-  // 1 where the velocities are known, else 0.
+  // 1 if the velocities are known, else 0.
   uint32_t has_velocity;
-  // Odometry: never jumps within an epoch, and drifts.
+  // Odometry: never jumps within an epoch, but drifts.
   struct semidense_transform world_from_camera;
-  // The best estimate in the map; jumps where the map is corrected.
+  // The best estimate in the map; jumps when the map is corrected.
   struct semidense_transform map_from_camera;
   // Relative to the keyframe, keyframe units.
   struct semidense_transform keyframe_from_camera;
-  // 6×6, of the left increment (translation, rotation) of camera_from_keyframe, keyframe units and radians.
+  // 6×6 covariance of the left increment (translation, rotation) of camera_from_keyframe, keyframe units and rad.
   double covariance[36];
-  // 6×6, of the left increment (translation, rotation) of `map_from_camera`, map units and radians.
+  // 6×6 covariance of the left increment (translation, rotation) of `map_from_camera`, map units and rad.
   double map_covariance[36];
-  // Of the camera, in its own axes, world units a second.
+  // Linear velocity of the camera in its own axes, world units per second.
   double linear_velocity[3];
-  // Of the camera, in its own axes, radians a second.
+  // Angular velocity of the camera in its own axes, radians per second.
   double angular_velocity[3];
-  // 6×6, of (linear, angular) velocity.
+  // 6×6 covariance of the velocity (linear, angular).
   double velocity_covariance[36];
   // a, b of `I_camera ≈ eᵃ I_keyframe + b`, grey levels.
   double brightness[2];
   // Share of the keyframe's points in view, 0 to 1.
   double in_view_ratio;
-  // Share of those compared that are explained, 0 to 1.
+  // Share of the compared points that are inliers, 0 to 1.
   double inlier_ratio;
   // Root mean square residual, grey levels.
   double residual_rmse;
@@ -166,23 +166,23 @@ typedef struct semidense_intrinsics {
   double cy;
 } semidense_intrinsics;
 
-// An image of the camera; its pixels lie in shared memory.
+// An image of the camera; its pixels are in shared memory.
 typedef struct semidense_frame {
   // Number of the frame at its source, as in its pose.
   uint64_t sequence;
   // Middle of the exposure, nanoseconds.
   int64_t capture_nanos;
-  // CLOCK_REALTIME of the frame, nanoseconds since 1970; 0 where unknown.
+  // CLOCK_REALTIME of the frame, nanoseconds since 1970; 0 if unknown.
   int64_t realtime_nanos;
-  // Exposure time, nanoseconds, 0 where unknown.
+  // Exposure time, nanoseconds, 0 if unknown.
   uint64_t exposure_nanos;
-  // Sensor gain, 0 where unknown.
+  // Sensor gain, 0 if unknown.
   float gain;
-  // Pixels in a row; rows follow each other without a gap.
+  // Pixels in a row; rows are contiguous.
   uint32_t width;
   // Rows.
   uint32_t height;
-  // Of the rectified image.
+  // Intrinsics of the rectified image.
   struct semidense_intrinsics intrinsics;
   // Grey, `width * height` bytes. Valid until the next `semidense_newest_frame` on this reader, or its end.
   const uint8_t *pixels;
@@ -202,19 +202,19 @@ typedef struct semidense_depth_point {
   float intensity;
 } semidense_depth_point;
 
-// A frame with depth; points and image lie in shared memory.
+// A frame with depth; points and image are in shared memory.
 typedef struct semidense_keyframe {
-  // Its id, as poses and graph name it.
+  // Its id, as in poses and the graph.
   uint64_t keyframe_id;
-  // Counts up with every change of the map: the same keyframe comes again with refined depth.
+  // Incremented with every change of the map: the same keyframe is sent again with refined depth.
   uint64_t revision;
   // Number of its frame.
   uint64_t sequence;
   // Stamp of its frame, nanoseconds.
   int64_t capture_nanos;
-  // How often the map had been corrected by then.
+  // Number of corrections of the map by then.
   uint64_t map_revision;
-  // Life of the map.
+  // Epoch of the map.
   uint32_t epoch;
   // Pixels in a row of its image.
   uint32_t width;
@@ -222,39 +222,39 @@ typedef struct semidense_keyframe {
   uint32_t height;
   // Points with depth.
   uint32_t num_points;
-  // Of its image.
+  // Intrinsics of its image.
   struct semidense_intrinsics intrinsics;
-  // Where odometry has it; the scale is its unit.
+  // Pose in the odometry world; the scale is its unit.
   struct semidense_transform world_from_keyframe;
-  // Where the map has it; the scale is its unit.
+  // Pose in the map; the scale is its unit.
   struct semidense_transform map_from_keyframe;
-  // `num_points` of them. Valid until the next `semidense_newest_keyframe` on this reader, or its end.
+  // Array of `num_points`. Valid until the next `semidense_newest_keyframe` on this reader, or its end.
   const struct semidense_depth_point *points;
   // Grey, `width * height` bytes. Valid for as long as `points`.
   const uint8_t *image;
 } semidense_keyframe;
 
-// Where the map has a keyframe.
+// The pose of a keyframe in the map.
 typedef struct semidense_keyframe_pose {
   // The keyframe.
   uint64_t keyframe_id;
   // Revision of its depth.
   uint64_t revision;
-  // Its place; the scale is its unit.
+  // Pose in the map; the scale is its unit.
   struct semidense_transform map_from_keyframe;
 } semidense_keyframe_pose;
 
 // The poses of all keyframes in the map.
 typedef struct semidense_graph {
-  // Newest revision of a keyframe in it.
+  // Newest revision of a keyframe in the graph.
   uint64_t revision;
-  // How often the map had been corrected.
+  // Number of corrections of the map.
   uint64_t map_revision;
-  // Life of the map.
+  // Epoch of the map.
   uint32_t epoch;
-  // Keyframes in it.
+  // Number of keyframes.
   uint32_t num_keyframes;
-  // `num_keyframes` of them. Valid until the next `semidense_newest_graph` on this reader, or its end.
+  // Array of `num_keyframes`. Valid until the next `semidense_newest_graph` on this reader, or its end.
   const struct semidense_keyframe_pose *keyframes;
 } semidense_graph;
 
@@ -264,64 +264,64 @@ extern "C" {
 
 // Waits for an instance and joins it.
 //
-// `instance`: its name, null for "semidense". `root`: its folder, null for the usual one (SEMIDENSE_ROOT and so on).
-// `wanted`: the sum of SEMIDENSE_WANT_… that are read. `timeout_ms`: how long to wait for it, -1 forever, 0 when it must
-// be there now. `reader` gets the reader; it is null after an error.
+// `instance`: its name, null for "semidense". `root`: its folder, null for the default (SEMIDENSE_ROOT and so on).
+// `wanted`: the sum of the SEMIDENSE_WANT_… to read. `timeout_ms`: how long to wait for the instance, -1 forever, 0
+// if it must be running already. `reader` receives the reader; it is null after an error.
 //
-// SEMIDENSE_STATUS_OK, or SEMIDENSE_STATUS_ERROR_NOT_RUNNING, …_WIRE_VERSION, …_TRANSPORT, …_ARGUMENT.
+// Returns SEMIDENSE_STATUS_OK, or SEMIDENSE_STATUS_ERROR_NOT_RUNNING, …_WIRE_VERSION, …_TRANSPORT, …_ARGUMENT.
 //
 // # Safety
-// Texts are null or end with a zero; `reader` is null or may be written to.
+// Texts are null or zero-terminated; `reader` is null or valid for writes.
 enum semidense_status semidense_open(const char *instance,
                                      const char *root,
                                      uint32_t wanted,
                                      int64_t timeout_ms,
                                      struct semidense_reader **reader);
 
-// Leaves the instance. All that the reader has given is no longer valid. Null does nothing.
+// Leaves the instance and invalidates everything the reader has returned. Does nothing for null.
 enum semidense_status semidense_close(struct semidense_reader *reader);
 
-// A file descriptor for poll, select and epoll, or -1 after an error: when it is readable, call `semidense_wait` with a
-// timeout of 0, then read until SEMIDENSE_STATUS_NONE. It belongs to the reader: do not read from it, do not close it.
+// A file descriptor for poll, select and epoll, or -1 after an error: when it is readable, call `semidense_wait` with
+// a timeout of 0, then read until SEMIDENSE_STATUS_NONE. It belongs to the reader: do not read from it or close it.
 int semidense_descriptor(const struct semidense_reader *reader);
 
-// Waits for messages, `timeout_ms` at most (-1: forever).
+// Waits for messages for at most `timeout_ms` (-1: forever).
 //
-// SEMIDENSE_STATUS_OK: there may be something to read; read each kind until SEMIDENSE_STATUS_NONE. SEMIDENSE_STATUS_NONE:
-// the time is over. SEMIDENSE_STATUS_ENDED: the run is over and all has been read; close the reader, and open another for
-// the next run.
+// Returns SEMIDENSE_STATUS_OK if there may be something to read: read each kind until SEMIDENSE_STATUS_NONE;
+// SEMIDENSE_STATUS_NONE after the timeout; SEMIDENSE_STATUS_ENDED once the run is over and everything has
+// been read: close the reader, and open another for the next run.
 enum semidense_status semidense_wait(struct semidense_reader *reader, int64_t timeout_ms);
 
-// The oldest pose that has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. 900 are kept.
+// Reads the oldest unread pose: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. 900 are kept.
 //
 // # Safety
-// `pose` is null or may be written to.
+// `pose` is null or valid for writes.
 enum semidense_status semidense_next_pose(struct semidense_reader *reader, struct semidense_pose *pose);
 
-// The newest frame, where it has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The one before is no longer valid,
-// whatever the answer.
+// Reads the newest frame, if unread: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The previous frame becomes
+// invalid, whatever is returned.
 //
 // # Safety
-// `frame` is null or may be written to.
+// `frame` is null or valid for writes.
 enum semidense_status semidense_newest_frame(struct semidense_reader *reader,
                                              struct semidense_frame *frame);
 
-// The newest keyframe or revision of its depth, where it has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The
-// one before is no longer valid, whatever the answer. A reader that comes late gets the active one.
+// Reads the newest keyframe or revision of its depth, if unread: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The
+// previous one becomes invalid, whatever is returned. A late reader receives the active keyframe.
 //
 // # Safety
-// `keyframe` is null or may be written to.
+// `keyframe` is null or valid for writes.
 enum semidense_status semidense_newest_keyframe(struct semidense_reader *reader, struct semidense_keyframe *keyframe);
 
-// The poses of all keyframes, where they have changed: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The ones before are valid
-// until the next SEMIDENSE_STATUS_OK.
+// Reads the poses of all keyframes, if they have changed: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The
+// previous ones are valid until the next SEMIDENSE_STATUS_OK.
 //
 // # Safety
-// `graph` is null or may be written to.
+// `graph` is null or valid for writes.
 enum semidense_status semidense_newest_graph(struct semidense_reader *reader,
                                              struct semidense_graph *graph);
 
-// How many messages were left out because they are broken; 0 after an error.
+// Number of messages refused because they are malformed; 0 after an error.
 uint64_t semidense_refused(const struct semidense_reader *reader);
 
 // Writes a transform as a 4×4 matrix, row by row; its rotation is multiplied by the scale.
@@ -330,14 +330,14 @@ uint64_t semidense_refused(const struct semidense_reader *reader);
 // `transform` is null or points to one; `matrix` is null or has room for 16 numbers.
 enum semidense_status semidense_matrix(const struct semidense_transform *transform, double *matrix);
 
-// Why the last call of this thread that failed did, in words: what, where, what to do. Never null; valid until the next
-// failure of this thread.
+// Describes the last failed call of this thread: what, where, what to do. Never null; valid until the
+// thread's next failure.
 const char *semidense_last_error(void);
 
 // The version of this library, as in "0.1.0".
 const char *semidense_version(void);
 
-// The version of the messages that this library reads: that of the pipeline must be the same.
+// The version of the messages that this library reads; it must equal that of the pipeline.
 uint32_t semidense_wire_version(void);
 
 // The name of a status, as in "SEMIDENSE_STATUS_OK".

@@ -1,4 +1,4 @@
-//! Messages, checked, as the structures of the header.
+//! Converts messages, after checking them, to the structures of the header.
 
 use std::mem::offset_of;
 
@@ -12,7 +12,7 @@ use semidense::wire::message::PoseMessage;
 
 use crate::types::{DepthPoint, Intrinsics, KeyframePose, Pose, Reason, State, Transform};
 
-// Points are read where they lie.
+// Points are read in place.
 const _: () = assert!(size_of::<DepthPoint>() == size_of::<CorePoint>());
 const _: () = assert!(align_of::<DepthPoint>() == align_of::<CorePoint>());
 const _: () = assert!(offset_of!(DepthPoint, u) == offset_of!(CorePoint, u));
@@ -35,17 +35,17 @@ fn rigid(transform: &SE3) -> Transform {
     }
 }
 
-/// A similarity.
+/// Converts a similarity.
 pub fn similarity(similarity: &Sim3) -> Transform {
     Transform { scale: similarity.scale, ..rigid(&similarity.rigid) }
 }
 
-/// Focal lengths and principal point.
+/// Converts focal lengths and principal point.
 pub fn intrinsics(k: &CoreIntrinsics) -> Intrinsics {
     Intrinsics { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy }
 }
 
-/// The place of a keyframe.
+/// Converts the pose of a keyframe.
 pub fn keyframe_pose(pose: &CorePose) -> KeyframePose {
     KeyframePose {
         keyframe_id: pose.keyframe_id,
@@ -54,7 +54,7 @@ pub fn keyframe_pose(pose: &CorePose) -> KeyframePose {
     }
 }
 
-/// A symmetric 6×6 matrix from its upper triangle, row by row.
+/// Expands the upper triangle of a symmetric 6×6 matrix, row by row.
 fn symmetric(upper_triangle: &[f64; 21]) -> [f64; 36] {
     let mut matrix = [0.0; 36];
     let mut entries = upper_triangle.iter();
@@ -94,7 +94,7 @@ fn codes(state: TrackingState) -> (State, Reason) {
     }
 }
 
-/// The pose of a message, checked.
+/// Checks a message and converts its pose.
 pub fn pose(message: &PoseMessage) -> Result<Pose, MessageError> {
     let estimate: PoseEstimate = pose_from_message(message)?;
     let (state, reason) = codes(estimate.state);
@@ -131,7 +131,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_triangle_fills_a_symmetric_matrix() {
+    fn the_upper_triangle_expands_to_a_symmetric_matrix() {
         let matrix = symmetric(&std::array::from_fn(|entry| entry as f64));
         assert_eq!(matrix[..6], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]);
         assert_eq!((matrix[7], matrix[35]), (6.0, 20.0));

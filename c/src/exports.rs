@@ -12,22 +12,22 @@ use crate::status::{Failure, Status, last_error, remember};
 use crate::table;
 use crate::types::{Frame, Graph, Keyframe, Pose, Transform};
 
-/// An open reader: closed by `semidense_close`, used by the thread that opened it alone.
+/// An open reader: closed by `semidense_close`, used only by the thread that opened it.
 pub struct ReaderHandle {
     _private: (),
 }
 
-/// Runs a call: what fails is kept for `semidense_last_error`, and so is a panic.
+/// Runs a call: an error or a panic is kept for `semidense_last_error`.
 fn call(act: impl FnOnce() -> Result<Status, Failure>) -> Status {
     let failure = match catch_unwind(AssertUnwindSafe(act)) {
         Ok(Ok(status)) => return status,
         Ok(Err(failure)) => failure,
         Err(_) => Failure::new(
             Status::ErrorInternal,
-            "a fault of libsemidense: please report it with what standard error says",
+            "a bug in libsemidense: please report it with the message on standard error",
         ),
     };
-    // A failure to keep the message is no reason to leave without a status.
+    // Return a status even if the message cannot be kept.
     let _ = catch_unwind(AssertUnwindSafe(|| remember(&failure.message)));
     failure.status
 }
@@ -40,10 +40,10 @@ fn number(handle: *const ReaderHandle) -> usize {
     handle.addr()
 }
 
-/// A text of the caller; `None` for null.
+/// A text from the caller; `None` for null.
 ///
 /// # Safety
-/// `text` is null or ends with a zero.
+/// `text` is null or a zero-terminated string.
 unsafe fn text<'a>(text: *const c_char, name: &str) -> Result<Option<&'a str>, Failure> {
     if text.is_null() {
         return Ok(None);
@@ -53,7 +53,7 @@ unsafe fn text<'a>(text: *const c_char, name: &str) -> Result<Option<&'a str>, F
     text.to_str().map(Some).map_err(|_| bad(&format!("{name} is not UTF-8")))
 }
 
-/// Checks that something can be written to `out`.
+/// Checks that `out` can be written to.
 fn check_out<T>(out: *mut T, name: &str) -> Result<(), Failure> {
     if out.is_null() {
         return Err(bad(&format!("{name} is null")));
@@ -64,10 +64,10 @@ fn check_out<T>(out: *mut T, name: &str) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Asks a reader, and writes what it gives to `out`.
+/// Calls `ask` on a reader and writes the result to `out`.
 ///
 /// # Safety
-/// `out` is null or may be written to.
+/// `out` is null or valid for writes.
 unsafe fn give<T>(
     reader: *mut ReaderHandle,
     out: *mut T,
@@ -84,7 +84,7 @@ unsafe fn give<T>(
     })
 }
 
-/// What a reader says; `otherwise` after an error.
+/// The answer of a reader; `otherwise` after an error.
 fn ask<T>(reader: *const ReaderHandle, otherwise: T, ask: impl FnOnce(&Reader) -> T) -> T {
     let mut answer = otherwise;
     call(|| {
@@ -96,14 +96,14 @@ fn ask<T>(reader: *const ReaderHandle, otherwise: T, ask: impl FnOnce(&Reader) -
 
 /// Waits for an instance and joins it.
 ///
-/// `instance`: its name, null for "semidense". `root`: its folder, null for the usual one (SEMIDENSE_ROOT and so on).
-/// `wanted`: the sum of SEMIDENSE_WANT_… that are read. `timeout_ms`: how long to wait for it, -1 forever, 0 when it must
-/// be there now. `reader` gets the reader; it is null after an error.
+/// `instance`: its name, null for "semidense". `root`: its folder, null for the default (SEMIDENSE_ROOT and so on).
+/// `wanted`: the sum of the SEMIDENSE_WANT_… to read. `timeout_ms`: how long to wait for the instance, -1 forever, 0
+/// if it must be running already. `reader` receives the reader; it is null after an error.
 ///
-/// SEMIDENSE_STATUS_OK, or SEMIDENSE_STATUS_ERROR_NOT_RUNNING, …_WIRE_VERSION, …_TRANSPORT, …_ARGUMENT.
+/// Returns SEMIDENSE_STATUS_OK, or SEMIDENSE_STATUS_ERROR_NOT_RUNNING, …_WIRE_VERSION, …_TRANSPORT, …_ARGUMENT.
 ///
 /// # Safety
-/// Texts are null or end with a zero; `reader` is null or may be written to.
+/// Texts are null or zero-terminated; `reader` is null or valid for writes.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn semidense_open(
     instance: *const c_char,
@@ -132,12 +132,12 @@ pub unsafe extern "C" fn semidense_open(
     })
 }
 
-/// Milliseconds; forever where they are negative.
+/// Converts milliseconds; `None`, for no limit, if negative.
 fn duration(milliseconds: i64) -> Option<Duration> {
     u64::try_from(milliseconds).ok().map(Duration::from_millis)
 }
 
-/// Leaves the instance. All that the reader has given is no longer valid. Null does nothing.
+/// Leaves the instance and invalidates everything the reader has returned. Does nothing for null.
 #[unsafe(no_mangle)]
 pub extern "C" fn semidense_close(reader: *mut ReaderHandle) -> Status {
     call(|| {
@@ -148,38 +148,38 @@ pub extern "C" fn semidense_close(reader: *mut ReaderHandle) -> Status {
     })
 }
 
-/// A file descriptor for poll, select and epoll, or -1 after an error: when it is readable, call `semidense_wait` with a
-/// timeout of 0, then read until SEMIDENSE_STATUS_NONE. It belongs to the reader: do not read from it, do not close it.
+/// A file descriptor for poll, select and epoll, or -1 after an error: when it is readable, call `semidense_wait` with
+/// a timeout of 0, then read until SEMIDENSE_STATUS_NONE. It belongs to the reader: do not read from it or close it.
 #[unsafe(no_mangle)]
 pub extern "C" fn semidense_descriptor(reader: *const ReaderHandle) -> c_int {
     ask(reader, -1, |reader| reader.descriptor())
 }
 
-/// Waits for messages, `timeout_ms` at most (-1: forever).
+/// Waits for messages for at most `timeout_ms` (-1: forever).
 ///
-/// SEMIDENSE_STATUS_OK: there may be something to read; read each kind until SEMIDENSE_STATUS_NONE. SEMIDENSE_STATUS_NONE:
-/// the time is over. SEMIDENSE_STATUS_ENDED: the run is over and all has been read; close the reader, and open another for
-/// the next run.
+/// Returns SEMIDENSE_STATUS_OK if there may be something to read: read each kind until SEMIDENSE_STATUS_NONE;
+/// SEMIDENSE_STATUS_NONE after the timeout; SEMIDENSE_STATUS_ENDED once the run is over and everything has
+/// been read: close the reader, and open another for the next run.
 #[unsafe(no_mangle)]
 pub extern "C" fn semidense_wait(reader: *mut ReaderHandle, timeout_ms: i64) -> Status {
     call(|| table::with(number(reader), |reader| reader.wait(duration(timeout_ms))))
 }
 
-/// The oldest pose that has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. 900 are kept.
+/// Reads the oldest unread pose: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. 900 are kept.
 ///
 /// # Safety
-/// `pose` is null or may be written to.
+/// `pose` is null or valid for writes.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn semidense_next_pose(reader: *mut ReaderHandle, pose: *mut Pose) -> Status {
     // SAFETY: the caller's promise.
     unsafe { give(reader, pose, Reader::next_pose) }
 }
 
-/// The newest frame, where it has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The one before is no longer valid,
-/// whatever the answer.
+/// Reads the newest frame, if unread: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The previous frame becomes
+/// invalid, whatever is returned.
 ///
 /// # Safety
-/// `frame` is null or may be written to.
+/// `frame` is null or valid for writes.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn semidense_newest_frame(
     reader: *mut ReaderHandle,
@@ -189,11 +189,11 @@ pub unsafe extern "C" fn semidense_newest_frame(
     unsafe { give(reader, frame, Reader::newest_frame) }
 }
 
-/// The newest keyframe or revision of its depth, where it has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The
-/// one before is no longer valid, whatever the answer. A reader that comes late gets the active one.
+/// Reads the newest keyframe or revision of its depth, if unread: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The
+/// previous one becomes invalid, whatever is returned. A late reader receives the active keyframe.
 ///
 /// # Safety
-/// `keyframe` is null or may be written to.
+/// `keyframe` is null or valid for writes.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn semidense_newest_keyframe(
     reader: *mut ReaderHandle,
@@ -203,11 +203,11 @@ pub unsafe extern "C" fn semidense_newest_keyframe(
     unsafe { give(reader, keyframe, Reader::newest_keyframe) }
 }
 
-/// The poses of all keyframes, where they have changed: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The ones before are valid
-/// until the next SEMIDENSE_STATUS_OK.
+/// Reads the poses of all keyframes, if they have changed: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The
+/// previous ones are valid until the next SEMIDENSE_STATUS_OK.
 ///
 /// # Safety
-/// `graph` is null or may be written to.
+/// `graph` is null or valid for writes.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn semidense_newest_graph(
     reader: *mut ReaderHandle,
@@ -217,7 +217,7 @@ pub unsafe extern "C" fn semidense_newest_graph(
     unsafe { give(reader, graph, Reader::newest_graph) }
 }
 
-/// How many messages were left out because they are broken; 0 after an error.
+/// Number of messages refused because they are malformed; 0 after an error.
 #[unsafe(no_mangle)]
 pub extern "C" fn semidense_refused(reader: *const ReaderHandle) -> u64 {
     ask(reader, 0, |reader| reader.refused)
@@ -254,8 +254,8 @@ pub unsafe extern "C" fn semidense_matrix(transform: *const Transform, matrix: *
     })
 }
 
-/// Why the last call of this thread that failed did, in words: what, where, what to do. Never null; valid until the next
-/// failure of this thread.
+/// Describes the last failed call of this thread: what, where, what to do. Never null; valid until the
+/// thread's next failure.
 #[unsafe(no_mangle)]
 pub extern "C" fn semidense_last_error() -> *const c_char {
     last_error()
@@ -272,7 +272,7 @@ pub extern "C" fn semidense_version() -> *const c_char {
     VERSION.as_ptr()
 }
 
-/// The version of the messages that this library reads: that of the pipeline must be the same.
+/// The version of the messages that this library reads; it must equal that of the pipeline.
 #[unsafe(no_mangle)]
 pub extern "C" fn semidense_wire_version() -> u32 {
     WIRE_VERSION

@@ -1,4 +1,4 @@
-//! Reads one run of an instance: the ports, what is borrowed from them, and the end of the run.
+//! Reads one run of an instance: the ports, the loans from them, and the end of the run.
 
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::time::{Duration, Instant};
@@ -27,14 +27,14 @@ use crate::conversion;
 use crate::status::{Failure, Status};
 use crate::types::{Frame, Graph, Keyframe, KeyframePose, Pose};
 
-/// Processes report once a second: one that has said nothing for so long is not there any more.
+/// Silence after which an instance counts as gone: processes report once a second.
 const LONGEST_SILENCE: Duration = Duration::from_secs(3);
-/// So often a descriptor becomes readable even where nothing comes, so that the end of a run is noticed.
+/// Interval at which a descriptor becomes readable even without messages, so that the end of a run is noticed.
 const HEARTBEAT: Duration = Duration::from_millis(500);
-/// Time between two attempts to join an instance that is not there yet.
+/// Pause between two attempts to join an instance that is not running yet.
 const RETRY_PERIOD: Duration = Duration::from_millis(100);
 
-/// Which kinds of messages are read, as bits.
+/// The kinds of messages to read, as bits.
 pub mod wants {
     /// Poses.
     pub const POSES: u32 = 1;
@@ -46,7 +46,7 @@ pub mod wants {
     pub const GRAPH: u32 = 8;
 }
 
-/// Reads one run.
+/// A reader of one run.
 pub struct Reader {
     poses: Option<Subscriber<PoseMessage, ()>>,
     frames: Option<Subscriber<u8, FrameHeader>>,
@@ -54,7 +54,7 @@ pub struct Reader {
     images: Option<Subscriber<u8, KeyframeImageHeader>>,
     graphs: Option<Subscriber<KeyframePoseMessage, GraphHeader>>,
     peers: Vec<Peer>,
-    // What is borrowed goes before the ports only when it is replaced; a port that is gone still keeps what is borrowed.
+    // Loans are released when they are replaced; a closed port keeps its loans alive.
     frame: Option<Received<u8, FrameHeader>>,
     depth: Option<Received<DepthPoint, KeyframeHeader>>,
     is_depth_new: bool,
@@ -66,7 +66,7 @@ pub struct Reader {
     last_health: i64,
     has_ended: bool,
     has_told_end: bool,
-    /// Messages that were left out because they are broken.
+    /// Number of messages refused because they are malformed.
     pub refused: u64,
     _hub: Hub,
 }
@@ -98,7 +98,7 @@ impl From<rustix::io::Errno> for Failure {
     }
 }
 
-/// Waits for the instance and joins it; `timeout` of `None` waits forever.
+/// Waits for the instance and joins it; without a `timeout`, indefinitely.
 pub fn open(place: &Place, wanted: u32, timeout: Option<Duration>) -> Result<Reader, Failure> {
     let begun = Instant::now();
     loop {
@@ -166,12 +166,12 @@ impl Reader {
         .flatten()
     }
 
-    /// Readable when it is time to look.
+    /// A descriptor that is readable when `wait` should be called.
     pub fn descriptor(&self) -> RawFd {
         self.waited.as_raw_fd()
     }
 
-    /// Waits until there is something to look at, and takes the wake-ups.
+    /// Waits until there may be something to read, and consumes the wake-ups.
     pub fn wait(&mut self, timeout: Option<Duration>) -> Result<Status, Failure> {
         let begun = Instant::now();
         loop {
@@ -179,12 +179,12 @@ impl Reader {
                 return Ok(Status::Ended);
             }
             let left = timeout.map(|timeout| timeout.saturating_sub(begun.elapsed()));
-            // The descriptor of all and the heartbeat wake it in time for the end of the run.
+            // The common descriptor and the heartbeat wake it in time for the end of the run.
             let step = left.map_or(HEARTBEAT, |left| left.min(HEARTBEAT));
             wait(&[], [self.waited.as_fd()], step).map_err(transport)?;
             let has_woken = self.take_wakes()?;
             if self.is_over()? {
-                // Once more, for what has come before the end.
+                // Once more, for messages that arrived before the end.
                 self.has_told_end = true;
                 return Ok(Status::Ok);
             }
@@ -197,20 +197,20 @@ impl Reader {
         }
     }
 
-    /// Whether a topic has woken.
+    /// Whether a topic has woken the reader.
     fn take_wakes(&self) -> Result<bool, Failure> {
         let events: Vec<&Events> = self.events().collect();
         let woken = events.iter().any(|events| is_readable(events.as_fd()));
         wait(&events, None, Duration::ZERO).map_err(transport)?;
         if is_readable(self.heartbeat.as_fd()) {
             let mut count = [0; 8];
-            // How many beats were missed does not matter.
+            // The number of missed beats does not matter.
             let _ = rustix::io::read(&self.heartbeat, &mut count);
         }
         Ok(woken)
     }
 
-    /// Whether tracker and mapper have finished, or nobody has said anything for long.
+    /// Whether tracker and mapper have finished, or no process has reported for too long.
     fn is_over(&mut self) -> Result<bool, Failure> {
         let mut newest = self.last_health;
         let mut finished = 0;
@@ -229,7 +229,7 @@ impl Reader {
         Ok(self.has_ended)
     }
 
-    /// What a reader that has nothing says.
+    /// The status without a message.
     pub fn nothing(&self) -> Status {
         if self.has_ended { Status::Ended } else { Status::None }
     }
@@ -248,7 +248,7 @@ impl Reader {
         Ok(None)
     }
 
-    /// The newest frame that has not been given.
+    /// The newest frame, if unread.
     pub fn newest_frame(&mut self) -> Result<Option<Frame>, Failure> {
         let port = self.frames.as_ref().ok_or_else(|| not_wanted("FRAMES"))?;
         self.frame = None;
@@ -273,13 +273,13 @@ impl Reader {
         Ok(Some(frame))
     }
 
-    /// The newest keyframe that has not been given.
+    /// The newest keyframe, if unread.
     pub fn newest_keyframe(&mut self) -> Result<Option<Keyframe>, Failure> {
         let none = || not_wanted("KEYFRAMES");
         let depths = self.depths.as_ref().ok_or_else(none)?;
         let images = self.images.as_ref().ok_or_else(none)?;
-        // Depth first: the mapper sends the image before it, so the image of what comes is here. What is held goes before
-        // more is taken: there is room to hold one. An image serves every revision of its keyframe's depth.
+        // Depth first: the mapper sends the image before it, so the image of a received depth is here. The old loan is
+        // released first: there is room for one. An image serves every revision of its keyframe's depth.
         if !self.is_depth_new || depths.has_unread()? {
             self.depth = None;
             self.depth = depths.receive()?;
@@ -294,7 +294,7 @@ impl Reader {
         };
         let ids = (depth.header().keyframe_id, depth.header().epoch);
         if ids != (image.header().keyframe_id, image.header().epoch) {
-            // The other half is on its way.
+            // The other half is in transit.
             return Ok(None);
         }
         self.is_depth_new = false;
@@ -303,7 +303,7 @@ impl Reader {
         Ok(keyframe)
     }
 
-    /// The newest graph that has not been given.
+    /// The newest graph, if unread.
     pub fn newest_graph(&mut self) -> Result<Option<Graph>, Failure> {
         let port = self.graphs.as_ref().ok_or_else(|| not_wanted("GRAPH"))?;
         let Some(received) = port.receive()? else { return Ok(None) };
@@ -330,13 +330,13 @@ fn not_wanted(kind: &str) -> Failure {
     Failure::new(Status::ErrorNotWanted, text)
 }
 
-/// The two halves of a keyframe, checked to the last point.
+/// A keyframe from its two halves, with every point checked.
 fn whole_keyframe(
     depth: &Received<DepthPoint, KeyframeHeader>,
     image: &Received<u8, KeyframeImageHeader>,
 ) -> Option<Keyframe> {
     let (header, image_header) = (depth.header(), image.header());
-    // Size, stride and intrinsics are checked as those of a frame of this size.
+    // Size, stride and intrinsics are checked like those of a frame of this size.
     let as_frame = FrameHeader {
         width: image_header.width,
         height: image_header.height,
@@ -370,7 +370,7 @@ fn whole_keyframe(
     })
 }
 
-/// A timer that is readable now and then.
+/// A timer that becomes readable every [`HEARTBEAT`].
 fn heartbeat() -> Result<OwnedFd, Failure> {
     let flags = TimerfdFlags::CLOEXEC | TimerfdFlags::NONBLOCK;
     let timer = timerfd_create(TimerfdClockId::Monotonic, flags)?;

@@ -1,15 +1,15 @@
-//! How a call ended, and in words why.
+//! Statuses of calls, and messages about failures.
 
 use std::cell::RefCell;
 use std::ffi::{CStr, CString, c_char};
 
-/// How a call ended: 0 and above are no errors.
+/// Outcome of a call: 0 and above are not errors.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Status {
     /// Done.
     Ok = 0,
-    /// Nothing new: everything has been read, or the time is over.
+    /// Nothing new: everything has been read, or the timeout has passed.
     None = 1,
     /// The run has ended and everything has been read: close the reader.
     Ended = 2,
@@ -17,15 +17,15 @@ pub enum Status {
     ErrorArgument = -1,
     /// The reader is closed, or was opened by another thread.
     ErrorHandle = -2,
-    /// No instance of this name runs here.
+    /// No instance of this name is running here.
     ErrorNotRunning = -3,
-    /// The instance speaks another wire version than this library.
+    /// The instance uses another wire version than this library.
     ErrorWireVersion = -4,
-    /// Shared memory cannot be used: another user's, full, or a limit.
+    /// Shared memory cannot be used: it belongs to another user, is full, or a limit is reached.
     ErrorTransport = -5,
     /// The reader was not opened for this kind of message.
     ErrorNotWanted = -6,
-    /// A fault of this library.
+    /// A defect of this library.
     ErrorInternal = -7,
 }
 
@@ -33,7 +33,7 @@ pub enum Status {
 #[derive(Debug, thiserror::Error)]
 #[error("{message}")]
 pub struct Failure {
-    /// The kind.
+    /// The kind of failure.
     pub status: Status,
     /// What, where, what to do.
     pub message: String,
@@ -53,9 +53,9 @@ thread_local! {
 /// Keeps the message for [`last_error`].
 pub fn remember(message: &str) {
     let text: Vec<u8> = message.bytes().filter(|&byte| byte != 0).collect();
-    // Without zeros it always is one.
+    // Without zeros it always converts.
     let text = CString::new(text).unwrap_or_default();
-    // A thread that is ending has no place for it.
+    // The storage of an ending thread is gone.
     let _ = LAST_ERROR.try_with(|last| last.try_borrow_mut().map(|mut last| *last = text));
 }
 

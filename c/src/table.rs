@@ -1,4 +1,4 @@
-//! The open readers of a thread. A handle is a number that is given once, and no address: it can be checked.
+//! The open readers of a thread. A handle is a number that is never reused, not an address: it can be validated.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -7,14 +7,14 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use crate::reader::Reader;
 use crate::status::{Failure, Status};
 
-/// Numbers begin where no address of an object can be, and are never given twice.
+/// Numbers that cannot be addresses of objects, and are never reused.
 static NEXT: AtomicUsize = AtomicUsize::new(1);
 
 thread_local! {
     static READERS: RefCell<BTreeMap<usize, Reader>> = const { RefCell::new(BTreeMap::new()) };
 }
 
-/// The thread is ending, or the table is in use by a call further up.
+/// The thread is ending, or an outer call is using the table.
 fn unusable() -> Failure {
     Failure::new(Status::ErrorHandle, "the reader is in use by a call that has not returned")
 }
@@ -34,14 +34,14 @@ fn with_all<T>(
         .map_err(|_| unusable())?
 }
 
-/// Keeps a reader; gives its number.
+/// Stores a reader and returns its number.
 pub fn insert(reader: Reader) -> Result<usize, Failure> {
     let number = NEXT.fetch_add(1, Ordering::Relaxed);
     with_all(|readers| Ok(readers.insert(number, reader)))?;
     Ok(number)
 }
 
-/// Lets `act` use the reader of this number.
+/// Calls `act` on the reader with this number.
 pub fn with<T>(
     number: usize,
     act: impl FnOnce(&mut Reader) -> Result<T, Failure>,
@@ -49,7 +49,7 @@ pub fn with<T>(
     with_all(|readers| act(readers.get_mut(&number).ok_or_else(unknown)?))
 }
 
-/// Takes the reader out.
+/// Removes the reader with this number.
 pub fn remove(number: usize) -> Result<Reader, Failure> {
     with_all(|readers| readers.remove(&number).ok_or_else(unknown))
 }

@@ -1,18 +1,18 @@
-//! What the header shows: plain structures, laid out as in C.
+//! The structures of the header, laid out as in C.
 //!
-//! Frames: the camera looks along z, x is right and y is down. `a_from_b` takes points in b to a. Lengths are map units, or
-//! those of the keyframe where it says so. Matrices are row by row.
+//! Frames: the camera looks along z, x is right and y is down. `a_from_b` maps points of b into a. Lengths
+//! are in map units, or in those of the keyframe where stated. Matrices are row by row.
 
 /// Tracking status of a frame.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum State {
-    /// No map that can be trusted yet; the pose is a working value.
+    /// There is no reliable map yet; the pose is provisional.
     #[default]
     Initializing = 0,
-    /// The pose is good to its covariance.
+    /// The pose is accurate to its covariance.
     Tracking = 1,
-    /// The pose is usable, but worse than it should be: see the reason.
+    /// The pose is usable, but less accurate than usual: see the reason.
     Degraded = 2,
     /// The pose is not claimed: see the reason.
     Lost = 3,
@@ -22,18 +22,18 @@ pub enum State {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Reason {
-    /// It is neither.
+    /// Neither degraded nor lost.
     #[default]
     None = 0,
-    /// Degraded: the deadline came before the finest level was solved.
+    /// Degraded: the deadline passed before the finest level was solved.
     Budget = 1,
     /// Degraded: few of the keyframe's points are in view.
     LowOverlap = 2,
     /// Degraded: the residuals are larger than noise and depth variance explain.
     HighResidual = 3,
-    /// Degraded: frames are missing between this one and the one before.
+    /// Degraded: frames are missing between this one and the previous one.
     Gap = 4,
-    /// Degraded: the known depth is out of view; the rotation holds, the position stands still.
+    /// Degraded: the known depth is out of view; the rotation is valid, the position is held.
     Turning = 5,
     /// Lost: the iteration left the image or became non-finite.
     Diverged = 6,
@@ -41,7 +41,7 @@ pub enum Reason {
     TooFewInliers = 7,
     /// Lost: the keyframe has no usable points.
     NoPoints = 8,
-    /// Lost: the frame has another size than the keyframe, or no contrast at all.
+    /// Lost: the frame differs in size from the keyframe, or has no contrast at all.
     UnusableFrame = 9,
     /// Lost: the mapper found the map inconsistent.
     MapRejected = 10,
@@ -59,55 +59,55 @@ pub struct Transform {
     pub scale: f64,
 }
 
-/// The pose of one frame; every frame has one, also when the camera is lost.
+/// The pose of one frame; every frame has one, even when the camera is lost.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pose {
-    /// Number of the frame at its source; a gap is a frame that is missing.
+    /// Number of the frame at its source; a gap is a missing frame.
     pub sequence: u64,
     /// Middle of the exposure, nanoseconds: CLOCK_MONOTONIC of a camera, else the recording's clock.
     pub capture_nanos: i64,
-    /// CLOCK_REALTIME of the frame, nanoseconds since 1970; 0 where unknown.
+    /// CLOCK_REALTIME of the frame, nanoseconds since 1970; 0 if unknown.
     pub realtime_nanos: i64,
     /// CLOCK_MONOTONIC when the pose was published.
     pub published_nanos: i64,
-    /// From the frame to the publication of its pose.
+    /// Time from the frame to the publication of its pose.
     pub latency_nanos: u64,
-    /// Keyframe it was tracked on, all ones before the first.
+    /// Keyframe it was tracked on; all ones before the first.
     pub keyframe_id: u64,
     /// Revision of that keyframe.
     pub keyframe_revision: u64,
-    /// How often the map had been corrected: `map_from_camera` may jump where it grows.
+    /// Number of corrections of the map: `map_from_camera` may jump when it increases.
     pub map_revision: u64,
-    /// Life of the map.
+    /// Epoch of the map.
     pub epoch: u32,
     /// Tracking status.
     pub state: State,
     /// Why it is degraded or lost.
     pub reason: Reason,
-    /// 1 where the velocities are known, else 0.
+    /// 1 if the velocities are known, else 0.
     pub has_velocity: u32,
-    /// Odometry: never jumps within an epoch, and drifts.
+    /// Odometry: never jumps within an epoch, but drifts.
     pub world_from_camera: Transform,
-    /// The best estimate in the map; jumps where the map is corrected.
+    /// The best estimate in the map; jumps when the map is corrected.
     pub map_from_camera: Transform,
     /// Relative to the keyframe, keyframe units.
     pub keyframe_from_camera: Transform,
-    /// 6×6, of the left increment (translation, rotation) of camera_from_keyframe, keyframe units and radians.
+    /// 6×6 covariance of the left increment (translation, rotation) of camera_from_keyframe, keyframe units and rad.
     pub covariance: [f64; 36],
-    /// 6×6, of the left increment (translation, rotation) of `map_from_camera`, map units and radians.
+    /// 6×6 covariance of the left increment (translation, rotation) of `map_from_camera`, map units and rad.
     pub map_covariance: [f64; 36],
-    /// Of the camera, in its own axes, world units a second.
+    /// Linear velocity of the camera in its own axes, world units per second.
     pub linear_velocity: [f64; 3],
-    /// Of the camera, in its own axes, radians a second.
+    /// Angular velocity of the camera in its own axes, radians per second.
     pub angular_velocity: [f64; 3],
-    /// 6×6, of (linear, angular) velocity.
+    /// 6×6 covariance of the velocity (linear, angular).
     pub velocity_covariance: [f64; 36],
     /// a, b of `I_camera ≈ eᵃ I_keyframe + b`, grey levels.
     pub brightness: [f64; 2],
     /// Share of the keyframe's points in view, 0 to 1.
     pub in_view_ratio: f64,
-    /// Share of those compared that are explained, 0 to 1.
+    /// Share of the compared points that are inliers, 0 to 1.
     pub inlier_ratio: f64,
     /// Root mean square residual, grey levels.
     pub residual_rmse: f64,
@@ -127,7 +127,7 @@ pub struct Intrinsics {
     pub cy: f64,
 }
 
-/// An image of the camera; its pixels lie in shared memory.
+/// An image of the camera; its pixels are in shared memory.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Frame {
@@ -135,17 +135,17 @@ pub struct Frame {
     pub sequence: u64,
     /// Middle of the exposure, nanoseconds.
     pub capture_nanos: i64,
-    /// CLOCK_REALTIME of the frame, nanoseconds since 1970; 0 where unknown.
+    /// CLOCK_REALTIME of the frame, nanoseconds since 1970; 0 if unknown.
     pub realtime_nanos: i64,
-    /// Exposure time, nanoseconds, 0 where unknown.
+    /// Exposure time, nanoseconds, 0 if unknown.
     pub exposure_nanos: u64,
-    /// Sensor gain, 0 where unknown.
+    /// Sensor gain, 0 if unknown.
     pub gain: f32,
-    /// Pixels in a row; rows follow each other without a gap.
+    /// Pixels in a row; rows are contiguous.
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// Of the rectified image.
+    /// Intrinsics of the rectified image.
     pub intrinsics: Intrinsics,
     /// Grey, `width * height` bytes. Valid until the next `semidense_newest_frame` on this reader, or its end.
     pub pixels: *const u8,
@@ -167,21 +167,21 @@ pub struct DepthPoint {
     pub intensity: f32,
 }
 
-/// A frame with depth; points and image lie in shared memory.
+/// A frame with depth; points and image are in shared memory.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Keyframe {
-    /// Its id, as poses and graph name it.
+    /// Its id, as in poses and the graph.
     pub keyframe_id: u64,
-    /// Counts up with every change of the map: the same keyframe comes again with refined depth.
+    /// Incremented with every change of the map: the same keyframe is sent again with refined depth.
     pub revision: u64,
     /// Number of its frame.
     pub sequence: u64,
     /// Stamp of its frame, nanoseconds.
     pub capture_nanos: i64,
-    /// How often the map had been corrected by then.
+    /// Number of corrections of the map by then.
     pub map_revision: u64,
-    /// Life of the map.
+    /// Epoch of the map.
     pub epoch: u32,
     /// Pixels in a row of its image.
     pub width: u32,
@@ -189,19 +189,19 @@ pub struct Keyframe {
     pub height: u32,
     /// Points with depth.
     pub num_points: u32,
-    /// Of its image.
+    /// Intrinsics of its image.
     pub intrinsics: Intrinsics,
-    /// Where odometry has it; the scale is its unit.
+    /// Pose in the odometry world; the scale is its unit.
     pub world_from_keyframe: Transform,
-    /// Where the map has it; the scale is its unit.
+    /// Pose in the map; the scale is its unit.
     pub map_from_keyframe: Transform,
-    /// `num_points` of them. Valid until the next `semidense_newest_keyframe` on this reader, or its end.
+    /// Array of `num_points`. Valid until the next `semidense_newest_keyframe` on this reader, or its end.
     pub points: *const DepthPoint,
     /// Grey, `width * height` bytes. Valid for as long as `points`.
     pub image: *const u8,
 }
 
-/// Where the map has a keyframe.
+/// The pose of a keyframe in the map.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KeyframePose {
@@ -209,7 +209,7 @@ pub struct KeyframePose {
     pub keyframe_id: u64,
     /// Revision of its depth.
     pub revision: u64,
-    /// Its place; the scale is its unit.
+    /// Pose in the map; the scale is its unit.
     pub map_from_keyframe: Transform,
 }
 
@@ -217,15 +217,15 @@ pub struct KeyframePose {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Graph {
-    /// Newest revision of a keyframe in it.
+    /// Newest revision of a keyframe in the graph.
     pub revision: u64,
-    /// How often the map had been corrected.
+    /// Number of corrections of the map.
     pub map_revision: u64,
-    /// Life of the map.
+    /// Epoch of the map.
     pub epoch: u32,
-    /// Keyframes in it.
+    /// Number of keyframes.
     pub num_keyframes: u32,
-    /// `num_keyframes` of them. Valid until the next `semidense_newest_graph` on this reader, or its end.
+    /// Array of `num_keyframes`. Valid until the next `semidense_newest_graph` on this reader, or its end.
     pub keyframes: *const KeyframePose,
 }
 
@@ -237,7 +237,7 @@ mod tests {
 
     use super::*;
 
-    /// Lines of C that hold the header's structure to ours.
+    /// Assertions in C that check the header's structure against ours.
     macro_rules! asserts {
         ($text:ident, $kind:ty, $name:literal, [$($field:ident),* $(,)?]) => {
             writeln!($text, "_Static_assert(sizeof({}) == {}, \"size of {}\");", $name, size_of::<$kind>(), $name).unwrap();
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn the_header_lays_out_what_we_write() {
+    fn the_header_has_the_layout_of_our_structures() {
         let mut text = "#include <stddef.h>\n#include <semidense.h>\n".to_owned();
         asserts!(text, Transform, "semidense_transform", [quaternion, translation, scale]);
         asserts!(

@@ -1,7 +1,7 @@
-//! Programs in C and C++ against the library and a pipeline that runs.
+//! C and C++ programs that use the library with a running pipeline.
 //!
-//! They are compiled with all warnings as errors and, where the compiler has them, with the sanitizers of addresses and
-//! undefined behaviour.
+//! They are compiled with all warnings as errors and, if the compiler has them, with the address and
+//! undefined-behaviour sanitizers.
 
 use std::fs;
 use std::io::{BufRead, BufReader};
@@ -16,7 +16,7 @@ use semidense::wire::place::Place;
 use semidense::wire::topic::WIRE_VERSION;
 use tempfile::TempDir;
 
-/// Far above anything that is expected: it ends a test that hangs.
+/// Far above any expected duration: it ends a test that hangs.
 const WATCH_DOG: Duration = Duration::from_secs(120);
 
 const C: &[&str] = &["cc", "-std=c11"];
@@ -28,14 +28,14 @@ fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Where cargo puts libraries and programs of this profile.
+/// Folder of the libraries and programs of this profile.
 fn built() -> PathBuf {
     let test = std::env::current_exe().unwrap();
     test.ancestors().nth(2).unwrap().to_owned()
 }
 
-/// Builds what `cargo test` does not: a library that Rust cannot link to, and, unless it is named with `SEMIDENSE_BIN`, the
-/// pipeline's program.
+/// Builds what `cargo test` does not: a library that Rust cannot link to, and the pipeline's program unless
+/// `SEMIDENSE_BIN` names it.
 fn build() {
     static BUILT: OnceLock<()> = OnceLock::new();
     BUILT.get_or_init(|| {
@@ -51,7 +51,7 @@ fn build() {
     });
 }
 
-/// The library as cargo names it.
+/// Path of the library under cargo's name.
 fn library() -> PathBuf {
     built().join("libsemidense_c.so")
 }
@@ -62,7 +62,7 @@ fn semidense() -> PathBuf {
     named.unwrap_or_else(|| built().join("semidense"))
 }
 
-/// An instance of its own, with a folder for programs and the library under its shared name.
+/// A separate instance, with a folder for programs and the library under its shared name.
 struct Rig {
     folder: TempDir,
     pipeline: Option<Child>,
@@ -78,7 +78,7 @@ impl Rig {
         Self { folder, pipeline: None }
     }
 
-    /// With a live run that continues for longer than any test.
+    /// A rig with a live run that lasts longer than any test.
     fn running() -> Self {
         let mut rig = Self::new();
         let mut command = rig.command(&semidense());
@@ -101,7 +101,7 @@ impl Rig {
         command
     }
 
-    /// Compiles a program and gives its path.
+    /// Compiles a program and returns its path.
     fn compile(&self, compiler: &[&str], source: &str, sanitize: bool) -> PathBuf {
         let program = self.folder.path().join(Path::new(source).file_stem().unwrap());
         let mut command = Command::new(compiler[0]);
@@ -144,7 +144,7 @@ impl Drop for Rig {
     }
 }
 
-/// Waits for the end; a program that hangs is killed and fails the test.
+/// Waits for the end of a program; one that hangs is killed and fails the test.
 fn end(mut child: Child) -> Output {
     let begun = Instant::now();
     while child.try_wait().unwrap().is_none() {
@@ -157,7 +157,7 @@ fn end(mut child: Child) -> Output {
     child.wait_with_output().unwrap()
 }
 
-/// Whether the compiler has the sanitizers with their libraries.
+/// Whether the compiler has the sanitizers and their libraries.
 fn has_sanitizers() -> bool {
     static FOUND: OnceLock<bool> = OnceLock::new();
     *FOUND.get_or_init(|| {
@@ -180,7 +180,7 @@ fn text(bytes: &[u8]) -> String {
 }
 
 #[test]
-fn a_program_in_c_reads_poses_and_ends_with_the_run() {
+fn a_c_program_reads_poses_and_ends_with_the_run() {
     let mut rig = Rig::running();
     let program = rig.compile(C, "examples/poses.c", true);
     let first = rig.run(&program, &["semidense", "3"]);
@@ -190,7 +190,7 @@ fn a_program_in_c_reads_poses_and_ends_with_the_run() {
         rig.command(&program).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines().map(Result::unwrap);
     let mut rows = Vec::new();
-    // A busy machine may take long to begin a map; one that is dead ends the lines.
+    // A busy machine may take long to start a map; if the pipeline dies, the lines end.
     while rows.len() < 30 || !rows.iter().any(|row: &Vec<String>| row[1] == "tracking") {
         let line = lines.next().expect("poses of a run that continues");
         rows.push(line.split(' ').map(str::to_owned).collect());
@@ -208,7 +208,7 @@ fn a_program_in_c_reads_poses_and_ends_with_the_run() {
 }
 
 #[test]
-fn a_program_in_cpp_reads_keyframes_frames_and_the_graph() {
+fn a_cpp_program_reads_keyframes_frames_and_the_graph() {
     let rig = Rig::running();
     let program = rig.compile(CPP, "examples/keyframes.cpp", true);
     let done = rig.run(&program, &["semidense", "3"]);
@@ -253,13 +253,13 @@ fn another_wire_version_is_refused_with_both_versions_in_c_and_cpp() {
     for program in programs {
         let done = rig.run(&program, &[]);
         let said = text(&done.stderr);
-        let both = format!("speaks wire version {other}, this program {WIRE_VERSION}");
+        let both = format!("uses wire version {other}, this program {WIRE_VERSION}");
         assert!(!done.status.success() && said.contains(&both), "{}: {said}", program.display());
     }
 }
 
 #[test]
-fn nothing_is_left_where_nothing_runs() {
+fn nothing_is_left_behind_without_a_running_instance() {
     let rig = Rig::new();
     let program = rig.folder.path().join("absent.c");
     let source = "#include <semidense.h>\nint main(void) { semidense_reader *r; return -semidense_open(0, 0, 15, 100, &r); }";
@@ -270,7 +270,7 @@ fn nothing_is_left_where_nothing_runs() {
 }
 
 #[test]
-fn what_is_installed_is_found_by_pkg_config_and_cmake() {
+fn the_installed_library_is_found_by_pkg_config_and_cmake() {
     let rig = Rig::new();
     let prefix = rig.folder.path().join("usr");
     let mut install = Command::new(root().join("install"));
@@ -316,7 +316,7 @@ fn what_is_installed_is_found_by_pkg_config_and_cmake() {
 }
 
 #[test]
-fn the_library_exports_its_own_functions_alone_and_the_header_has_each() {
+fn the_library_exports_only_its_own_functions_and_the_header_declares_each() {
     build();
     let library = library();
     let listed = Command::new("nm").args(["-D", "--defined-only"]).arg(&library).output().unwrap();

@@ -1,7 +1,7 @@
 """Draws the depth of the active keyframe over its image, live.
 
-python keyframe_depth.py                  # a window that follows, until the run ends or it is closed
-python keyframe_depth.py --save depth.png # the next keyframe as a picture
+python keyframe_depth.py                  # a live window, until the run ends or it is closed
+python keyframe_depth.py --save depth.png # the next keyframe, saved as a picture
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import semidense
 def draw(figure: Any, keyframe: semidense.Keyframe) -> None:
     """Image in grey, depth in colours: near is red, far is blue."""
     points = keyframe.points[keyframe.has_depth]
-    # The nearest and farthest hundredth would take all the colours.
+    # Otherwise the nearest and farthest hundredth would use up the colours.
     nearest, farthest = np.percentile(points["inverse_depth"], [99, 1]) if len(points) else (1.0, 0.0)
     figure.clear()
     axes = figure.subplots()

@@ -2,7 +2,7 @@
 
 python trajectory.py                     # live, until the run ends or the window is closed
 python trajectory.py output/latest       # a finished run
-python trajectory.py … --save path.png   # into a file (live: after --seconds)
+python trajectory.py … --save path.png   # to a file (live: after --seconds)
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import numpy as np
 
 import semidense
 
-# Between two drawings of a live trajectory.
+# Between two updates of a live trajectory.
 REDRAW_SECS = 0.2
 
 
 def draw(axes: Any, positions: Any, keyframes: Any, title: str) -> None:
-    """From above: x right, z forward."""
+    """Draws the trajectory from above: x right, z forward."""
     axes.clear()
     axes.plot(positions[:, 0], positions[:, 2], lw=1.5, label="camera")
     if len(keyframes):
@@ -36,13 +36,13 @@ def draw(axes: Any, positions: Any, keyframes: Any, title: str) -> None:
 
 
 def with_gaps(positions: Any, epochs: Any) -> Any:
-    """A row of NaN where another epoch begins: it has another origin and unit, and no line leads there."""
+    """Inserts a row of NaN where another epoch begins: its origin and unit differ, so no line connects the two."""
     begins = np.flatnonzero(np.diff(epochs)) + 1
     return np.insert(positions, begins, np.nan, axis=0)
 
 
 def finished(folder: str, axes: Any) -> None:
-    """A run that is over."""
+    """Draws a finished run."""
     run = semidense.load(folder)
     if run.trajectory is None:
         raise semidense.BadRun(f"{run.folder}: no trajectory.txt")
@@ -52,7 +52,7 @@ def finished(folder: str, axes: Any) -> None:
 
 
 def live(arguments: argparse.Namespace, axes: Any, plot: Any) -> None:
-    """A run as it grows."""
+    """Draws a run as it grows."""
     positions: List[Any] = []
     epochs: List[int] = []
     begun = drawn = time.monotonic()

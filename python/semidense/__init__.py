@@ -4,8 +4,8 @@
 >>> for pose in semidense.poses():
 ...     print(pose.state.name, pose.world_from_camera.translation)
 
-Everything here reads what a running instance puts into shared memory, without a copy where it is large, or what a finished
-run has written (`load`). A reader cannot slow the pipeline down.
+The package reads what a running instance publishes in shared memory, without copying large data, or the files of a
+finished run (`load`). A reader cannot slow the pipeline down.
 """
 
 from ._wire import BUCKET_ENDS_MS, WIRE_VERSION, MapState, ProcessState, Reason, Scheduling, State

@@ -1,4 +1,4 @@
-"""`python -m semidense`: prints the poses of a running instance, one a line."""
+"""`python -m semidense`: prints the poses of a running instance, one per line."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _print(arguments: argparse.Namespace) -> None:
 
 
 def main(arguments: Optional[List[str]] = None) -> int:
-    """Runs the command line; gives the exit code."""
+    """Runs the command line and returns the exit code."""
     parser = _parser()
     parsed = parser.parse_args(arguments)
     if parsed.count is not None and parsed.count < 1:
@@ -86,7 +86,7 @@ def main(arguments: Optional[List[str]] = None) -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        # Whoever read it has had enough; Python would complain at exit.
+        # The reader closed the pipe; Python would complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except SemidenseError as error:

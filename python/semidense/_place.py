@@ -1,4 +1,4 @@
-"""Where an instance lives: its name, the folder of its files, the prefix of its shared memory.
+"""The place of an instance: its name, the folder of its files, the prefix of its shared memory.
 
 The same rules as in the Rust readers (`src/wire/place.rs`, `src/wire/root_folder.rs`).
 """
@@ -17,15 +17,15 @@ from ._wire import ROOT_VARIABLE, SYSTEM_ROOT
 from .errors import BadPlace, SemidenseError
 
 SHARED_MEMORY = "/dev/shm"
-# The socket of a listener lies in the folder, and a socket's path has at most 107 bytes.
+# A listener's socket is in the folder, and the path of a socket has at most 107 bytes.
 MAX_ROOT_BYTES = 48
 JOIN_LOCK = ".join.lock"
 MEMBERS = ("capture", "tracker", "mapper")
 # Joining takes milliseconds, on a busy machine a second.
 LONGEST_HOLD_SECS = 10.0
-# What a reader with all topics needs of shared memory at most: without it the process would die of SIGBUS.
+# Upper limit for the shared memory needed by a reader of all topics: without it the process would die of SIGBUS.
 JOIN_BYTES = 1 << 20
-# Names that are tried in the temporary folder.
+# Number of names tried in the temporary folder.
 PRIVATE_NAMES = 20
 
 AnyPath = Union[str, "os.PathLike[str]"]
@@ -39,13 +39,13 @@ def _is_mine(path: str) -> bool:
 
 
 def _private_root(temporary: str) -> str:
-    """This user's folder in `temporary`: the first that is ours, else the first name that is free."""
+    """This user's folder in `temporary`: the first that is ours, else the first free name."""
     usual = os.path.join(temporary, f"semidense-{os.geteuid()}")
     names = [usual] + [f"{usual}-{n}" for n in range(1, PRIVATE_NAMES)]
     free = None
     for name in names:
         try:
-            # Without following a link: it could lead anywhere.
+            # Without following a link, which could lead anywhere.
             found = os.lstat(name)
         except FileNotFoundError:
             free = free or name
@@ -59,13 +59,13 @@ def _private_root(temporary: str) -> str:
 
 
 def usual_root() -> str:
-    """The folder that all processes of this user find when nobody names one."""
+    """The folder that all processes of this user find by default."""
     for variable in (ROOT_VARIABLE, "RUNTIME_DIRECTORY"):
         if os.environ.get(variable):
             return os.environ[variable]
     if _is_mine(SYSTEM_ROOT):
         return SYSTEM_ROOT
-    # After `su` or `sudo` it may name the folder of the user before.
+    # After `su` or `sudo` it may name the folder of the previous user.
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if runtime and _is_mine(runtime):
         return os.path.join(runtime, "semidense")
@@ -84,10 +84,10 @@ def prefix_of(root: str) -> str:
 
 
 class Place:
-    """An instance and its folder. Making one touches nothing."""
+    """An instance and its folder. Creating one touches no files."""
 
     def __init__(self, instance: str, root: Optional[AnyPath]) -> None:
-        """The place of `instance` below `root`, below the usual folder where that is None."""
+        """The place of `instance` below `root`, by default below the usual folder."""
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,32}", instance):
             raise BadPlace(
                 f"instance {instance!r}: a name has 1 to 32 letters, digits, '-' and '_' (as --instance of semidense)"
@@ -102,11 +102,11 @@ class Place:
         self.prefix = prefix_of(self.root)
 
     def is_there(self) -> bool:
-        """Whether somebody has made topics below the root: only then may it be joined, else folders are left."""
+        """Whether there are topics below the root: joining otherwise would leave folders behind."""
         return os.path.isdir(os.path.join(self.root, "services"))
 
     def running(self) -> Optional[str]:
-        """The id of a process of the instance that runs, by its claim."""
+        """The id of a running process of the instance, from its claim."""
         for member in MEMBERS:
             path = os.path.join(self.root, f"{self.instance}.{member}.lock")
             try:
@@ -121,7 +121,7 @@ class Place:
 
     @contextlib.contextmanager
     def hold(self) -> Iterator[None]:
-        """Keeps the last process of a run from clearing up while we join."""
+        """Keeps the last process of a run from cleaning up while we join."""
         path = os.path.join(self.root, JOIN_LOCK)
         end = time.monotonic() + LONGEST_HOLD_SECS
         while True:
@@ -134,7 +134,7 @@ class Place:
                 os.close(descriptor)
 
     def _lock(self, descriptor: int, path: str, end: float) -> bool:
-        """Whether the file is locked and still the one at `path`."""
+        """Locks the file; returns whether it is still the one at `path`."""
         while True:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -142,7 +142,7 @@ class Place:
             except BlockingIOError:
                 if time.monotonic() > end:
                     raise SemidenseError(
-                        f"{path} is held by another process for more than {LONGEST_HOLD_SECS:.0f} s: "
+                        f"{path} has been held by another process for more than {LONGEST_HOLD_SECS:.0f} s: "
                         "stop it (fuser names it), or choose another root"
                     ) from None
                 time.sleep(0.002)
@@ -163,14 +163,14 @@ class Place:
                 yield os.path.join(SHARED_MEMORY, name)
 
     def keep_to_user(self) -> None:
-        """Takes from all others what iceoryx2 gives them: its counter of nodes is made for everybody."""
+        """Revokes other users' access: iceoryx2 creates its node counter accessible to everybody."""
         for path in self._segments():
             if path.endswith(".global_mgmt"):
                 with contextlib.suppress(OSError):
                     os.chmod(path, 0o600)
 
     def reserve(self) -> None:
-        """Takes what the segments promise: a page that is missing when it is touched would end the process."""
+        """Allocates the segments fully: touching a page that cannot be allocated would end the process."""
         for path in self._segments():
             try:
                 descriptor = os.open(path, os.O_WRONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)

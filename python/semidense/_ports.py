@@ -1,4 +1,4 @@
-"""Ports of iceoryx2 for one run of an instance: opened together, read without copying."""
+"""Ports of iceoryx2 for one run of an instance, opened together and read without copying."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ._place import Place
 from ._wire import TOPICS, WIRE_VERSION
 from .errors import NotRunning, SemidenseError, TooManyHeld, TooManyReaders, WireVersion
 
-# iceoryx2 compares sizes and names of types; a table that is not that of the Rust definitions would show here first.
+# iceoryx2 compares sizes and names of types; a table that differs from the Rust definitions is detected here first.
 _kinds: List[Any] = [kind for topic in TOPICS.values() for kind in (topic.payload, topic.header)]
 for _kind in _kinds:
     if hasattr(_kind, "SIZE") and ctypes.sizeof(_kind) != _kind.SIZE:
@@ -21,11 +21,11 @@ for _kind in _kinds:
 
 
 class Sample:
-    """A message in shared memory: it stays there for as long as it, or an array of it, is referred to."""
+    """A message in shared memory, held for as long as it, or an array of it, is referenced."""
 
     def __init__(self, sample: Any, topic: _wire.Topic, ports: Any) -> None:
         self._sample = sample
-        # A port that is gone gives its places back, whoever still looks at them.
+        # A closed port releases its loans even if they are still in use.
         self._ports = ports
         self._topic = topic
         self.length: int = sample.header.number_of_elements
@@ -48,15 +48,15 @@ class Sample:
         if size == 0:
             return np.empty(0, dtype=np.dtype(kind))
         buffer: Any = (ctypes.c_ubyte * size).from_address(self._sample.payload_ptr)
-        # The array refers to the buffer, the buffer to the sample: the last one to go gives the place back, and the
-        # sample goes before its port.
+        # The array references the buffer, the buffer the sample: deleting the last one releases the loan, and the
+        # sample is deleted before its port.
         buffer.owner = (self._ports, self._sample)
         array = np.frombuffer(buffer, dtype=np.dtype(kind))
         array.flags.writeable = False
         return array
 
     def copied_array(self) -> Any:
-        """The payload as a read-only numpy array of its own."""
+        """A copy of the payload as a read-only numpy array."""
         array = self.array().copy()
         array.flags.writeable = False
         return array
@@ -87,7 +87,7 @@ class Subscriber:
                 raise SemidenseError(f"topic {self._name}: {error}") from None
             most = service.static_config.max_subscribers
             raise TooManyReaders(
-                f"{path} has {most} subscribers already, as many as it may have: stop one ({_readers(service)})"
+                f"{path} already has its maximum of {most} subscribers: stop one ({_readers(service)})"
             ) from None
         self._ports: Tuple[Any, ...] = (node, self._port)
 
@@ -99,28 +99,28 @@ class Subscriber:
             if "ExceedsMaxBorrow" not in f"{error!r}":
                 raise SemidenseError(f"topic {self._name}: receiving failed ({error})") from None
             raise TooManyHeld(
-                f"{self.topic.path}: {self.most_held} messages are held, and there is room for no more: keep the "
-                "`.copy()` of what you keep, and let go of the arrays of the others (they refer to shared memory)"
+                f"{self.topic.path}: {self.most_held} messages are held, and there is no room for more: keep a "
+                "`.copy()` of what you need, and release the arrays of the others (they refer to shared memory)"
             ) from None
         return None if sample is None else Sample(sample, self.topic, self._ports)
 
     def close(self) -> None:
-        """Lets go of the port; what has been received stays."""
+        """Closes the port; received messages remain valid."""
         self._port = None
         self._ports = ()
 
 
 def _readers(service: Any) -> str:
-    """Who has opened a service, the pipeline's own processes left out."""
+    """The nodes that have opened a service, except for the pipeline's own processes."""
     names = []
     for node in service.nodes:
-        # Of a process that is gone, or another user's, no details are known.
+        # A dead process, or another user's, has no details.
         view = node[0] if isinstance(node, iox2.NodeState.Alive) else None
         if view is not None and view.details is not None:
             name, process = view.details.name.as_str(), view.details.process_id
             if name not in ("capture", "tracker", "mapper"):
                 names.append(f"{name}, process {process}")
-    return "; ".join(sorted(names)) or "their names are not known"
+    return "; ".join(sorted(names)) or "their names are unknown"
 
 
 def service_name(place: Place, path: str) -> str:
@@ -129,12 +129,12 @@ def service_name(place: Place, path: str) -> str:
 
 
 def not_running(place: Place) -> NotRunning:
-    """Why nothing can be read there."""
+    """The error for a place where nothing can be read."""
     holder = place.running()
     if holder is not None:
         return NotRunning(
             f"instance `{place.instance}` runs (process {holder}), but its topics are not here: it is just starting, or "
-            "this container has a /dev/shm of its own (docker run --ipc=host shares the host's)"
+            "this container has its own /dev/shm (docker run --ipc=host shares the host's)"
         )
     return NotRunning(
         f"nothing is running as instance `{place.instance}` in {place.root}: "
@@ -150,11 +150,11 @@ def _config(place: Place) -> Any:
 
 
 def _check_version(config: Any, place: Place) -> None:
-    """Topics of another version have other names: without this look the reader would wait forever."""
+    """Detects topics of another version, which have other names: otherwise the reader would wait forever."""
     try:
         services = iox2.Service.list(config, iox2.ServiceType.Ipc)
     except Exception:
-        # What cannot be listed cannot be opened either, and that says why.
+        # Services that cannot be listed cannot be opened either, and opening gives the reason.
         return
     head = f"{place.instance}/v"
     for service in services:
@@ -165,11 +165,11 @@ def _check_version(config: Any, place: Place) -> None:
 
 
 def make_node(place: Place, name: str) -> Any:
-    """Joins the instance; to be called while the place is held."""
+    """Joins the instance; call this while the place is held."""
     iox2.set_log_level(iox2.LogLevel.Fatal)
     config = _config(place)
     builder = iox2.NodeBuilder.new().name(iox2.NodeName.new(name)).config(config)
-    # Ctrl-C is Python's.
+    # Python handles Ctrl-C.
     builder = builder.signal_handling_mode(iox2.SignalHandlingMode.Disabled)
     try:
         node = builder.create(iox2.ServiceType.Ipc)
@@ -187,7 +187,7 @@ class Ports:
     """The open topics of one run."""
 
     def __init__(self, place: Place, name: str, paths: Tuple[str, ...], wakes: Tuple[str, ...]) -> None:
-        """Opens `paths`, and waits on the wake-ups of `wakes`."""
+        """Opens the topics `paths`, and waits on the wake-ups of `wakes`."""
         if not place.is_there():
             raise not_running(place)
         place.check_room()
@@ -213,7 +213,7 @@ class Ports:
             raise not_running(place) from None
 
     def wait(self, seconds: float) -> None:
-        """Until something comes, at most so long. Other threads run meanwhile; a signal is handled after it."""
+        """Waits for a message, at most for `seconds`. Other threads run meanwhile; signals are handled afterwards."""
         duration = iox2.Duration.from_nanos(max(1, int(seconds * 1e9)))
         try:
             if self._wait_set is None:
@@ -223,11 +223,11 @@ class Ports:
             for listener in self._listeners:
                 listener.try_wait()
         except (iox2.ListenerWaitError, iox2.WaitSetRunError):
-            # A signal: Python handles it now, and the caller looks again.
+            # A signal: Python handles it now, and the caller checks again.
             return
 
     def close(self) -> None:
-        """Leaves the instance; what has been received stays."""
+        """Leaves the instance; received messages remain valid."""
         self._guards.clear()
         self._wait_set = None
         self._listeners.clear()

@@ -1,7 +1,7 @@
-"""Rigid transforms and similarities between frames, as numpy arrays.
+"""Rigid transforms and similarities between coordinate frames, as numpy arrays.
 
-A name says between which frames: `world_from_camera` takes a point in the camera to the world. Cameras look along z, x is
-right and y is down. Quaternions are in the order x, y, z, w.
+Names state both frames: `world_from_camera` maps a point in the camera to the world. Cameras look along z, x is right
+and y is down. Quaternions are in the order x, y, z, w.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 
-# Farthest a quaternion may be from unit length: rounding, not another transform.
+# Largest deviation of a quaternion from unit length: rounding, not another transform.
 QUATERNION_TOLERANCE = 1e-6
 
 
@@ -43,7 +43,7 @@ def _product(left: Floats, right: Floats) -> Floats:
 
 
 class Transform:
-    """`x' = scale · R x + t`: a rigid transform where `scale` is 1, else a similarity."""
+    """`x' = scale · R x + t`: a rigid transform if `scale` is 1, else a similarity."""
 
     __slots__ = ("quaternion", "translation", "scale")
 
@@ -57,7 +57,7 @@ class Transform:
 
     @classmethod
     def identity(cls) -> Transform:
-        """The transform that changes nothing."""
+        """The identity transform."""
         return cls([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0])
 
     @property
@@ -67,21 +67,21 @@ class Transform:
 
     @property
     def matrix(self) -> Floats:
-        """The whole as a 4×4 matrix; its rotation is multiplied by the scale."""
+        """The transform as a 4×4 matrix; its rotation is multiplied by the scale."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.scale * self.rotation
         matrix[:3, 3] = self.translation
         return matrix
 
     def inverse(self) -> Transform:
-        """`b_from_a` of `a_from_b`."""
+        """The inverse: `b_from_a` for `a_from_b`."""
         x, y, z, w = self.quaternion
         back = np.array([-x, -y, -z, w])
         scale = 1.0 / self.scale
         return Transform(back, -scale * (_rotation(back) @ self.translation), scale)
 
     def is_valid(self) -> bool:
-        """Whether all is finite, the quaternion of unit length and the scale positive."""
+        """Whether all numbers are finite, the quaternion has unit length and the scale is positive."""
         is_unit = abs(float(np.linalg.norm(self.quaternion)) - 1.0) <= QUATERNION_TOLERANCE
         is_scale = np.isfinite(self.scale) and self.scale > 0.0
         return bool(is_unit and is_scale and np.isfinite(self.translation).all())
@@ -103,14 +103,14 @@ class Transform:
         return points @ (self.scale * self.rotation).T + self.translation
 
     def __repr__(self) -> str:
-        """All numbers, shortly."""
+        """All numbers, abbreviated."""
         t, q = self.translation, self.quaternion
         text = f"t=({t[0]:.4g}, {t[1]:.4g}, {t[2]:.4g}) q=({q[0]:.4g}, {q[1]:.4g}, {q[2]:.4g}, {q[3]:.4g})"
         return f"Transform({text})" if self.scale == 1.0 else f"Transform({text} scale={self.scale:.4g})"
 
 
 def symmetric(upper_triangle: npt.ArrayLike, size: int) -> Floats:
-    """The symmetric matrix of its upper triangle, row by row."""
+    """The symmetric matrix with this upper triangle, row by row."""
     values = np.asarray(upper_triangle, dtype=np.float64)
     matrix = np.zeros((size, size))
     rows, columns = np.triu_indices(size)
@@ -146,12 +146,12 @@ class Intrinsics:
         return self.width, self.height
 
     def is_valid(self) -> bool:
-        """Whether a camera can have them."""
+        """Whether the values are possible for a camera."""
         numbers = np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()
         return bool(numbers and self.fx > 0 and self.fy > 0 and self.width > 0 and self.height > 0)
 
     def __repr__(self) -> str:
-        """All numbers, shortly."""
+        """All numbers, abbreviated."""
         return (
             f"Intrinsics(fx={self.fx:.2f}, fy={self.fy:.2f}, cx={self.cx:.2f}, cy={self.cy:.2f}, "
             f"width={self.width}, height={self.height})"

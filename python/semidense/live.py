@@ -1,4 +1,4 @@
-"""One loop for one kind of message, and commands: what most programs need."""
+"""Loops over one kind of message, and commands: all that most programs need."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .errors import CommandFailed
 from .messages import Frame, Graph, Health, Keyframe, Pose, _text
 from .reader import M, Reader
 
-# Between two looks for an answer.
+# Between two checks for an answer.
 ANSWER_PAUSE_SECS = 0.01
 PATH_BYTES = 4096
 _SAVE_FOLDER, _LOAD_FOLDER, _LOCATE_IN_FOLDER = 2, 3, 4
@@ -29,7 +29,7 @@ def _stream(
     follow: bool,
     copy: bool = True,
 ) -> Iterator[M]:
-    # Joined when it is called: what is wrong is said there, not at the first turn of the loop.
+    # Joined by the call itself, so that errors are raised there, not in the first iteration of the loop.
     reader = Reader(kind, instance=instance, root=root, timeout=timeout, follow=follow, copy=copy)
 
     def messages() -> Iterator[M]:
@@ -46,11 +46,11 @@ def poses(
     timeout: Optional[float] = None,
     follow: bool = False,
 ) -> Iterator[Pose]:
-    """Every pose as it is published, also of frames that are lost, until the run ends.
+    """Every pose as it is published, including those of lost frames, until the run ends.
 
     Waits for the instance for `timeout` seconds (None: forever), then raises `NotRunning`. `root` is the folder of the
-    instance where it is not the usual one (`SEMIDENSE_ROOT`). With `follow` it continues to the next run. 900 poses
-    are kept for a loop that is late.
+    instance if it is not the usual one (`SEMIDENSE_ROOT`). With `follow` it continues to the next run. 900 poses
+    are kept for a slow loop.
     """
     return _stream(Pose, instance, root, timeout, follow)
 
@@ -62,9 +62,9 @@ def frames(
     timeout: Optional[float] = None,
     follow: bool = False,
 ) -> Iterator[Frame]:
-    """Every image of the camera, without a copy; of a loop that is late the oldest are skipped (`sequence` shows it).
+    """Every image of the camera, without copying; a slow loop skips the oldest ones (visible in `sequence`).
 
-    At most 4 may be held at a time, that of the loop included: keep `frame.copy()`.
+    At most 4 may be held at once, including that of the loop: keep `frame.copy()` instead.
     """
     return _stream(Frame, instance, root, timeout, follow)
 
@@ -103,7 +103,7 @@ def health(
     timeout: Optional[float] = None,
     follow: bool = False,
 ) -> Iterator[Health]:
-    """What capture, tracker and mapper say of themselves: once a second and on every change."""
+    """Health reports of capture, tracker and mapper: once a second and on every change."""
     return _stream(Health, instance, root, timeout, follow)
 
 
@@ -114,7 +114,7 @@ def save_map(
     root: Optional[AnyPath] = None,
     timeout: float = 60.0,
 ) -> None:
-    """Saves the map into `folder`, as `semidense map save`; into the one that the mapper keeps it in where that is None."""
+    """Saves the map to `folder`, as `semidense map save` does; by default to the mapper's own folder."""
     _ask(_SAVE_FOLDER, folder, instance, root, timeout)
 
 
@@ -126,7 +126,7 @@ def load_map(
     root: Optional[AnyPath] = None,
     timeout: float = 60.0,
 ) -> None:
-    """Goes over to the map in `folder`, as `semidense map load`; with `read_only` the camera is only located in it."""
+    """Switches to the map in `folder`, as `semidense map load` does; with `read_only` the camera is only localised."""
     _ask(_LOCATE_IN_FOLDER if read_only else _LOAD_FOLDER, folder, instance, root, timeout)
 
 
@@ -148,7 +148,7 @@ def _ask(kind: int, folder: Optional[AnyPath], instance: str, root: Optional[Any
         except (iox2.RequestResponseOpenError, iox2.EventOpenError):
             raise not_running(place) from None
         except (iox2.ClientCreateError, iox2.NotifierCreateError) as error:
-            raise CommandFailed(f"mapper/command: {error}: others ask at this moment; try again") from None
+            raise CommandFailed(f"mapper/command: {error}: other programs are sending requests; try again") from None
         place.reserve()
     request = _wire.CommandRequest(kind=kind, path_bytes=len(path))
     request.path[: len(path)] = path

@@ -1,6 +1,6 @@
-"""What comes out of shared memory: poses, frames, keyframes, the graph, health.
+"""The messages in shared memory: poses, frames, keyframes, the graph, health.
 
-Each is checked before it is given: a message that is broken is counted (`Reader.refused`) and left out.
+Each is checked before it is returned: an invalid message is counted (`Reader.refused`) and skipped.
 """
 
 from __future__ import annotations
@@ -25,46 +25,46 @@ _DIAGONAL = (0, 6, 11, 15, 18, 20)
 
 
 class BrokenMessage(ValueError):
-    """A message that cannot be what it says."""
+    """A message with invalid content."""
 
 
 class Velocity:
-    """How the camera moves at the stamp of the frame, in its own axes (x right, y down, z forward)."""
+    """Velocity of the camera at the stamp of the frame, in its own axes (x right, y down, z forward)."""
 
     __slots__ = ("linear", "angular", "covariance")
 
     def __init__(self, linear: Floats, angular: Floats, covariance: Floats) -> None:
-        """World units a second, radians a second, and the 6×6 covariance of both."""
+        """World units per second, radians per second, and the 6×6 covariance of both."""
         self.linear, self.angular, self.covariance = linear, angular, covariance
 
     def __repr__(self) -> str:
-        """Both, shortly."""
+        """Both, abbreviated."""
         return f"Velocity(linear={np.round(self.linear, 4)}, angular={np.round(self.angular, 4)})"
 
 
 class Pose:
-    """The pose of one frame. Every frame has one, also when the camera is lost: see `state` and `is_tracked`."""
+    """The pose of one frame. Every frame has one, even when the camera is lost: see `state` and `is_tracked`."""
 
     def __init__(self, message: _wire.PoseMessage) -> None:
-        """From a message, which is kept; raises `BrokenMessage`."""
+        """Takes a message, which is kept; raises `BrokenMessage`."""
         self._message = message
         self.sequence: int = message.sequence
-        """Number of the frame at its source; a gap is a frame that is missing."""
+        """Number of the frame at its source; a gap is a missing frame."""
         self.capture_nanos: int = message.capture_nanos
         """Middle of the exposure, nanoseconds: CLOCK_MONOTONIC of a camera, else the recording's clock."""
         self.realtime_nanos: int = message.realtime_nanos
-        """The same instant since 1970 (`time.time_ns()`), 0 where unknown."""
+        """The same instant since 1970 (`time.time_ns()`), 0 if unknown."""
         self.published_nanos: int = message.published_nanos
         """CLOCK_MONOTONIC (`time.monotonic_ns()`) when it was published."""
         self.latency_nanos: int = message.latency_nanos
-        """From the frame to the publication of its pose."""
+        """Time from the frame to the publication of its pose."""
         self.epoch: int = message.epoch
-        """Life of the map."""
+        """Epoch of the map."""
         self.map_revision: int = message.map_revision
-        """How often the map had been corrected: `map_from_camera` may jump where it grows."""
+        """Number of corrections of the map: `map_from_camera` may jump when it increases."""
         keyframe_id: int = message.keyframe_id
         self.keyframe_id: Optional[int] = None if keyframe_id == NO_KEYFRAME else keyframe_id
-        """The keyframe it was tracked on, None before the first."""
+        """The keyframe it was tracked on; None before the first."""
         try:
             self.state = State(message.state)
             claims_reason = self.state in (State.DEGRADED, State.LOST)
@@ -82,7 +82,7 @@ class Pose:
             raise BrokenMessage("a variance of map_covariance is negative")
         transforms = (self.world_from_camera, self.map_from_camera, self.keyframe_from_camera)
         if not all(transform.is_valid() for transform in transforms):
-            raise BrokenMessage("a transform is not valid")
+            raise BrokenMessage("a transform is invalid")
 
     @property
     def is_tracked(self) -> bool:
@@ -101,12 +101,12 @@ class Pose:
 
     @cached_property
     def world_from_camera(self) -> Transform:
-        """Odometry: never jumps within an epoch, and drifts."""
+        """Odometry: never jumps within an epoch, but drifts."""
         return rigid(self._message.world_from_camera)
 
     @cached_property
     def map_from_camera(self) -> Transform:
-        """The best estimate in the map; jumps where the map is corrected."""
+        """The best estimate in the map; jumps when the map is corrected."""
         return rigid(self._message.map_from_camera)
 
     @cached_property
@@ -126,7 +126,7 @@ class Pose:
 
     @cached_property
     def velocity(self) -> Optional[Velocity]:
-        """How the camera moves; None where this frame or the one before has no pose."""
+        """The velocity of the camera; None if this frame or the previous one has no pose."""
         message = self._message
         if not message.has_velocity:
             return None
@@ -162,7 +162,7 @@ class Pose:
         return self.line()
 
     def __repr__(self) -> str:
-        """What identifies it."""
+        """A short description."""
         return f"Pose(sequence={self.sequence}, state={self.state.name}, world_from_camera={self.world_from_camera})"
 
 
@@ -170,15 +170,15 @@ def _intrinsics(header: Any) -> Intrinsics:
     fx, fy, cx, cy = (float(value) for value in header.intrinsics)
     intrinsics = Intrinsics(fx, fy, cx, cy, header.width, header.height)
     if not intrinsics.is_valid():
-        raise BrokenMessage("size and intrinsics are not those of a camera")
+        raise BrokenMessage("invalid image size or intrinsics")
     return intrinsics
 
 
 class Frame:
-    """A rectified grey image of the camera. `image` lies in shared memory, read-only, for as long as it is referred to."""
+    """A rectified grey image of the camera. `image` stays in shared memory, read-only, for as long as it is referenced."""
 
     def __init__(self, header: _wire.FrameHeader, pixels: Image) -> None:
-        """From a header and its pixels; raises `BrokenMessage`."""
+        """Takes a header and its pixels; raises `BrokenMessage`."""
         self.intrinsics = _intrinsics(header)
         if header.stride != header.width or pixels.size != header.width * header.height:
             raise BrokenMessage(f"{pixels.size} pixels, not {header.width} × {header.height}")
@@ -189,53 +189,53 @@ class Frame:
         self.capture_nanos: int = header.capture_nanos
         """Middle of the exposure, nanoseconds."""
         self.realtime_nanos: int = header.realtime_nanos
-        """The same instant since 1970, 0 where unknown."""
+        """The same instant since 1970, 0 if unknown."""
         self.exposure_nanos: int = header.exposure_nanos
-        """Exposure time, 0 where unknown."""
+        """Exposure time, 0 if unknown."""
         self.gain: float = header.gain
-        """Sensor gain, 0 where unknown."""
+        """Sensor gain, 0 if unknown."""
         self._header = header
 
     def copy(self) -> Frame:
-        """The same in memory of its own: may be kept forever."""
+        """A copy in separate memory, which may be kept indefinitely."""
         return Frame(self._header, self.image.ravel().copy())
 
     def __repr__(self) -> str:
-        """What identifies it."""
+        """A short description."""
         return f"Frame(sequence={self.sequence}, {self.intrinsics.width}×{self.intrinsics.height})"
 
 
 class Keyframe:
-    """A frame with depth: `points` and `image`, read-only, in memory of its own."""
+    """A frame with depth: `points` and `image`, read-only, in separate memory."""
 
     def __init__(
         self, header: _wire.KeyframeHeader, points: Points, image_header: _wire.KeyframeImageHeader, pixels: Image
     ) -> None:
-        """From the messages of its depth and its image; raises `BrokenMessage`."""
+        """Takes the messages of its depth and its image; raises `BrokenMessage`."""
         self.intrinsics = _intrinsics(header)
         sizes = {(h.width, h.height) for h in (header, image_header)} | {(image_header.stride, header.height)}
         if len(sizes) != 1 or pixels.size != header.width * header.height:
             raise BrokenMessage("image and depth have different sizes")
         self.points: Points = points
-        """Structured array: u, v (pixels), inverse_depth (1/keyframe units), variance (of it), intensity."""
+        """Structured array: u, v (pixels), inverse_depth (1/keyframe units), variance (of inverse_depth), intensity."""
         self.image: Image = pixels.reshape(header.height, header.width)
         """Height × width, uint8."""
         self.keyframe_id: int = header.keyframe_id
-        """Its id, as poses and graph name it."""
+        """Its id, as in poses and the graph."""
         self.revision: int = header.revision
-        """Counts up with every change of the map: the same keyframe comes again with refined depth."""
+        """Incremented with every change of the map: the same keyframe is sent again with refined depth."""
         self.sequence: int = header.sequence
         """Number of its frame."""
         self.capture_nanos: int = header.capture_nanos
         """Stamp of its frame, nanoseconds."""
         self.epoch: int = header.epoch
-        """Life of the map."""
+        """Epoch of the map."""
         self.map_revision: int = header.map_revision
-        """How often the map had been corrected by then."""
+        """Number of corrections of the map by then."""
         self.world_from_keyframe = rigid(header.world_from_keyframe)
-        """Where odometry has it, and its unit as the scale."""
+        """Pose in the odometry world, with its unit as the scale."""
         self.map_from_keyframe = rigid(header.map_from_keyframe)
-        """Where the map has it, and its unit as the scale."""
+        """Pose in the map, with its unit as the scale."""
         try:
             self.map_state = MapState(header.map_state)
             """Whether the map is established."""
@@ -253,21 +253,21 @@ class Keyframe:
         if not inside or not all(np.isfinite(points[field]).all() for field in fields):
             raise BrokenMessage("a point lies outside the image or is not finite")
         if not (self.world_from_keyframe.is_valid() and self.map_from_keyframe.is_valid()):
-            raise BrokenMessage("a transform is not valid")
+            raise BrokenMessage("a transform is invalid")
 
     @cached_property
     def place_covariance(self) -> Floats:
-        """7×7, of the left increment (translation, rotation, ln scale) of `map_from_keyframe`."""
+        """7×7 covariance of the left increment (translation, rotation, ln scale) of `map_from_keyframe`."""
         return symmetric(self._headers[0].place_covariance, 7)
 
     @cached_property
     def mode_covariance(self) -> Floats:
-        """3×3, of the relative errors that all inverse depths share: for each unit of X, of Y and of ln d."""
+        """3×3 covariance of the relative errors common to all inverse depths, per unit of X, of Y and of ln d."""
         return symmetric(self._headers[0].mode_covariance, 3)
 
     @property
     def has_depth(self) -> npt.NDArray[np.bool_]:
-        """Of each point whether its depth is finite: an inverse depth of 0 is infinitely far."""
+        """Whether the depth of each point is finite: an inverse depth of 0 is infinitely far."""
         mask: npt.NDArray[np.bool_] = self.points["inverse_depth"] > 0.0
         return mask
 
@@ -297,30 +297,30 @@ class Keyframe:
         return self.map_from_keyframe @ self.points_in_keyframe()
 
     def points_in_world(self) -> Floats:
-        """N×3, the points with finite depth where odometry has them."""
+        """N×3, the points with finite depth in the odometry world, world units."""
         return self.world_from_keyframe @ self.points_in_keyframe()
 
     def copy(self) -> Keyframe:
-        """The same with arrays that may be written to."""
+        """A copy with writable arrays."""
         header, image_header = self._headers
         return Keyframe(header, self.points.copy(), image_header, self.image.ravel().copy())
 
     def __repr__(self) -> str:
-        """What identifies it."""
+        """A short description."""
         return f"Keyframe(id={self.keyframe_id}, revision={self.revision}, {len(self.points)} points)"
 
 
 class KeyframePose:
-    """Where the map has a keyframe."""
+    """The pose of a keyframe in the map."""
 
     __slots__ = ("keyframe_id", "revision", "map_from_keyframe")
 
     def __init__(self, keyframe_id: int, revision: int, map_from_keyframe: Transform) -> None:
-        """Its id, the revision of its depth, and its place with its unit as the scale."""
+        """Its id, the revision of its depth, and its pose with its unit as the scale."""
         self.keyframe_id, self.revision, self.map_from_keyframe = keyframe_id, revision, map_from_keyframe
 
     def __repr__(self) -> str:
-        """All of it."""
+        """All values."""
         return f"KeyframePose(id={self.keyframe_id}, {self.map_from_keyframe})"
 
 
@@ -328,32 +328,32 @@ class Graph:
     """The poses of all keyframes in the map, sent whenever they change."""
 
     def __init__(self, header: _wire.GraphHeader, messages: Any) -> None:
-        """From a header and an array of `KeyframePoseMessage`; raises `BrokenMessage`."""
+        """Takes a header and an array of `KeyframePoseMessage`; raises `BrokenMessage`."""
         self.revision: int = header.revision
-        """Newest revision of a keyframe in it."""
+        """Newest revision of a keyframe in the graph."""
         self.map_revision: int = header.map_revision
-        """How often the map had been corrected."""
+        """Number of corrections of the map."""
         self.epoch: int = header.epoch
-        """Life of the map."""
+        """Epoch of the map."""
         self.keyframes = [KeyframePose(m.keyframe_id, m.revision, rigid(m.map_from_keyframe)) for m in messages]
-        """One for each keyframe."""
+        """The pose of each keyframe."""
         if not all(keyframe.map_from_keyframe.is_valid() for keyframe in self.keyframes):
-            raise BrokenMessage("a transform is not valid")
+            raise BrokenMessage("a transform is invalid")
 
     def positions(self) -> Floats:
-        """N×3, where the keyframes are in the map."""
+        """N×3, the positions of the keyframes in the map."""
         return np.array([k.map_from_keyframe.translation for k in self.keyframes]).reshape(-1, 3)
 
     def __iter__(self) -> Iterator[KeyframePose]:
-        """All keyframes."""
+        """Iterates over all keyframes."""
         return iter(self.keyframes)
 
     def __len__(self) -> int:
-        """How many keyframes there are."""
+        """Number of keyframes."""
         return len(self.keyframes)
 
     def __repr__(self) -> str:
-        """What identifies it."""
+        """A short description."""
         return f"Graph(map_revision={self.map_revision}, {len(self)} keyframes)"
 
 
@@ -363,7 +363,7 @@ def _text(bytes_: Any, length: int) -> str:
 
 
 class Health:
-    """What a process says of itself, once a second and on every change."""
+    """The health report of a process, once a second and on every change."""
 
     def __init__(self, process: str, message: _wire.HealthMessage) -> None:
         """`process` is capture, tracker or mapper; raises `BrokenMessage`."""
@@ -371,17 +371,17 @@ class Health:
         """capture, tracker or mapper."""
         try:
             self.state = ProcessState(message.state)
-            """What it is doing."""
+            """State of the process."""
             self.scheduling = Scheduling(message.scheduling)
             """Active scheduling."""
         except ValueError as error:
             raise BrokenMessage(str(error)) from None
         self.message = message
-        """As it was sent, with all counters."""
+        """The original message, with all counters."""
         self.cause = _text(message.cause, message.cause_bytes)
-        """Why the state is what it is."""
+        """The reason for the state."""
         self.warning = _text(message.warning, message.warning_bytes)
-        """What the system refused and which limit to raise, else empty."""
+        """What the system refused, and the limit to raise; else empty."""
         self.source = _text(message.source, message.source_bytes)
         """Capture: where its frames come from."""
         self.published_nanos: int = message.published_nanos
@@ -389,18 +389,18 @@ class Health:
         self.process_id: int = message.process_id
         """Its process id."""
         self.frames: int = message.frames
-        """Frames sent, tracked or mapped."""
+        """Number of frames sent, tracked or mapped."""
         self.rate_hz: float = message.rate_hz
-        """The same a second; NaN before one is over."""
+        """The same per second; NaN during the first second."""
         self.dropped: int = message.dropped
-        """Frames that came too late to be handled."""
+        """Number of late frames, which were not processed."""
 
     def latency_counts(self) -> npt.NDArray[np.uint64]:
         """The histogram of latencies; its buckets end at `semidense.BUCKET_ENDS_MS`."""
         return np.array(self.message.latency_counts, dtype=np.uint64)
 
     def latency_ms(self, share: float) -> Optional[float]:
-        """The latency that `share` (0 to 1) of the frames do not exceed, to its bucket; None without frames."""
+        """The latency not exceeded by `share` (0 to 1) of the frames, rounded to its bucket; None without frames."""
         counts = self.latency_counts().astype(np.float64)
         if not counts.any():
             return None
@@ -408,10 +408,10 @@ class Health:
         return _wire.BUCKET_ENDS_MS[min(index, len(counts) - 1)]
 
     def __repr__(self) -> str:
-        """One line."""
+        """A one-line description."""
         return f"Health({self.process}: {self.state.name}, {self.frames} frames, {self.rate_hz:.1f} Hz)"
 
 
 def copy_of(kind: Any, address: int) -> Any:
-    """A structure of its own from what lies at `address`."""
+    """A copy of the structure at `address`."""
     return kind.from_buffer_copy((ctypes.c_char * ctypes.sizeof(kind)).from_address(address))

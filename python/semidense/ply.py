@@ -1,4 +1,4 @@
-"""PLY files of points: binary or text, with whatever properties a vertex has."""
+"""PLY files of points: binary or text, with arbitrary vertex properties."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
-# No header is longer: a file that is no PLY is not read to its end for one.
+# No header is longer: a file that is not a PLY is not read to its end in search of one.
 MAX_HEADER_LINES = 200
 
 
@@ -28,11 +28,11 @@ def _header(lines: List[str], path: str) -> Tuple[str, int, List[Tuple[str, str]
         elif words[:1] == ["element"] and len(words) == 3:
             element = words[1]
             if count >= 0 and element == "vertex":
-                raise BadRun(f"{path}: vertices are announced twice")
+                raise BadRun(f"{path}: vertices are declared twice")
             if element == "vertex":
                 count = int(words[2]) if words[2].isdigit() else -1
             elif count < 0:
-                raise BadRun(f"{path}: {element} stands before the vertices")
+                raise BadRun(f"{path}: {element} precedes the vertices")
         elif words[:1] == ["property"] and element == "vertex":
             if len(words) != 3 or words[1] not in _TYPES:
                 raise BadRun(f"{path}: the property `{' '.join(words[1:])}` of a vertex is not a number")
@@ -43,7 +43,7 @@ def _header(lines: List[str], path: str) -> Tuple[str, int, List[Tuple[str, str]
 
 
 def read_ply(path: str) -> Optional[npt.NDArray[np.void]]:
-    """The vertices as a structured array, mapped from the file where they lie so; None where there is no file."""
+    """The vertices as a structured array, memory-mapped if the layout permits; None without a file."""
     try:
         file = open(path, "rb")  # noqa: SIM115
     except FileNotFoundError:
@@ -68,7 +68,7 @@ def read_ply(path: str) -> Optional[npt.NDArray[np.void]]:
         except ValueError as error:
             raise BadRun(f"{path}: {error}") from None
         if os.fstat(file.fileno()).st_size - begin < count * kind.itemsize:
-            raise BadRun(f"{path}: cut off: {count} points of {kind.itemsize} bytes are announced")
+            raise BadRun(f"{path}: truncated: the header announces {count} points of {kind.itemsize} bytes")
         if count == 0:
             return np.empty(0, dtype=kind)
         return np.memmap(path, dtype=kind, mode="r", offset=begin, shape=(count,))

@@ -1,4 +1,4 @@
-"""Reads one instance, whenever it runs: waits for it, gives what it sends, notices its end."""
+"""Reads one instance, whenever it runs: waits for it, returns its messages, notices its end."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ._wire import ProcessState
 from .errors import NotRunning
 from .messages import BrokenMessage, Frame, Graph, Health, Keyframe, Pose
 
-# Between two attempts to join an instance that is not there yet.
+# Between two attempts to join an instance that is not running yet.
 RETRY_SECS = 0.1
-# After so long a wait it is said what is waited for.
+# Wait after which a message is logged that names what is missing.
 PATIENCE_SECS = 1.0
-# Longest wait in one go: so late a Ctrl-C is heard, or the end of a run.
+# Longest uninterrupted wait, hence the delay until a Ctrl-C or the end of a run is noticed.
 WAIT_SECS = 0.1
-# Processes report once a second: one that has said nothing for so long is not there any more.
+# Processes report once a second: a process that is silent for longer counts as gone.
 LONGEST_SILENCE_SECS = 3.0
 
 _LOG = logging.getLogger("semidense")
@@ -37,7 +37,7 @@ _PATHS: Dict[type, Tuple[str, ...]] = {
     Health: ("capture/health", "tracker/health", "mapper/health"),
 }
 _HEALTH = _PATHS[Health]
-# Health comes once a second at least, with or without a wake-up.
+# Health is sent at least once a second, so it needs no wake-up.
 _WAKES: Dict[type, Tuple[str, ...]] = {
     Pose: ("tracker/pose",),
     Frame: ("capture/frame",),
@@ -66,17 +66,17 @@ class Reader:
         follow: bool = False,
         copy: bool = True,
     ) -> None:
-        """Waits for the instance for `timeout` seconds (None: forever), else `NotRunning`.
+        """Waits for the instance for `timeout` seconds (None: forever), then raises `NotRunning`.
 
         With `follow` it continues with the next run of the instance when one ends. Without `copy` the points of a
-        keyframe stay in shared memory, where a reader may hold one: `del` it before the next.
+        keyframe stay in shared memory, where a reader may hold one keyframe: `del` it before the next.
         """
         unknown = [kind for kind in kinds if kind not in _PATHS]
         if unknown or not kinds:
             raise TypeError(f"name what to read: Pose, Frame, Keyframe, Graph or Health, not {unknown}")
         self.place = Place(instance, root)
         self.refused = 0
-        """Messages that were left out because they are broken."""
+        """Number of messages skipped because they are invalid."""
         self._kinds = tuple(dict.fromkeys(kinds))
         self._timeout = timeout
         self._follow = follow
@@ -84,7 +84,7 @@ class Reader:
         self._ports: Optional[Ports] = None
         self._states: Dict[str, ProcessState] = {}
         self._heard = time.monotonic()
-        # Depth whose image has not come yet, and the newest image: it serves every revision of its keyframe's depth.
+        # Depth whose image has not arrived, and the newest image, which serves every revision of its keyframe's depth.
         self._depth: Optional[Tuple[Any, Any]] = None
         self._image: Optional[Tuple[Any, Any]] = None
         self._join()
@@ -116,7 +116,7 @@ class Reader:
         return True
 
     def read(self, timeout: float = 0.0) -> List[Message]:
-        """What has come, waiting `timeout` seconds at most for it; empty also when the run is over (`is_open`)."""
+        """Pending messages, waiting for at most `timeout` seconds; also empty when the run is over (`is_open`)."""
         end = time.monotonic() + timeout
         while True:
             messages = list(self._take())
@@ -130,11 +130,11 @@ class Reader:
 
     @property
     def is_open(self) -> bool:
-        """Whether the run that is read still continues."""
+        """Whether the run being read still continues."""
         return self._ports is not None
 
     def __iter__(self) -> Iterator[Message]:
-        """Every message as it comes, until the run ends (with `follow`: forever)."""
+        """Every message as it arrives, until the run ends (with `follow`: forever)."""
         while True:
             while self._ports is not None:
                 is_quiet = True
@@ -153,7 +153,7 @@ class Reader:
             self._join()
 
     def _is_over(self) -> bool:
-        """Whether tracker and mapper have ended, or nobody has said anything for long."""
+        """Whether tracker and mapper have finished, or no process has reported for too long."""
         ended = [self._states.get(process) is ProcessState.FINISHED for process in ("tracker", "mapper")]
         return all(ended) or time.monotonic() - self._heard > LONGEST_SILENCE_SECS
 
@@ -166,7 +166,7 @@ class Reader:
         return sample
 
     def _take(self) -> Iterator[Message]:
-        """All that is unread, keyframes before the poses that name them; the newest of what replaces the older."""
+        """All unread messages, keyframes before the poses that name them; of replaceable ones only the newest."""
         takes: Dict[type, Callable[[], Iterator[Message]]] = {
             Keyframe: self._keyframe,
             Graph: self._graph,
@@ -202,7 +202,7 @@ class Reader:
                 yield from self._checked(lambda m=message: Pose(m))  # type: ignore[misc]
 
     def _frames(self) -> Iterator[Frame]:
-        # One at a time: few may be held.
+        # One at a time: only few may be held.
         if (sample := self._receive("capture/frame")) is not None:
             header, pixels = sample.header(), sample.array()
             del sample
@@ -215,8 +215,8 @@ class Reader:
             yield from self._checked(lambda: Graph(header, messages))
 
     def _keyframe(self) -> Iterator[Keyframe]:
-        # Depth first: the mapper sends the image before it, so the image of what comes is here. Points are copied unless
-        # told otherwise: there is room to hold one, and the loop still has the one before when the next comes. An image
+        # Depth first: the mapper sends the image before it, so the image of a received depth is here. Points are copied
+        # by default: only one may be held, and the loop still has the previous one when the next arrives. An image
         # serves all revisions of its keyframe.
         is_free = self._copy or self._depth is None
         if is_free and (depth := self._receive("mapper/keyframe")) is not None:
@@ -229,16 +229,16 @@ class Reader:
             return
         (header, points), (image_header, pixels) = self._depth, self._image
         if (header.keyframe_id, header.epoch) != (image_header.keyframe_id, image_header.epoch):
-            # The other half is on its way; a newer depth replaces this one.
+            # The other half is in transit; a newer depth replaces this one.
             if not self._copy:
-                # It would take the place of the newer one.
+                # Holding it would leave no room for the newer one.
                 self._depth = None
             return
         self._depth = None
         yield from self._checked(lambda: Keyframe(header, points, image_header, pixels))
 
     def close(self) -> None:
-        """Leaves the instance; what has been given stays readable."""
+        """Leaves the instance; returned messages stay readable."""
         self._depth = self._image = None
         if self._ports is not None:
             ports, self._ports = self._ports, None
@@ -246,7 +246,7 @@ class Reader:
                 ports.close()
 
     def __enter__(self) -> Reader:
-        """Itself."""
+        """Returns the reader itself."""
         return self
 
     def __exit__(

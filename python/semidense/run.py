@@ -1,4 +1,4 @@
-"""A finished run: what `run` and `replay` have written into their output folder, as numpy arrays."""
+"""A finished run: the files in the output folder of `run` or `replay`, as numpy arrays."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from .errors import BadRun
 from .geometry import Floats, Transform
 from .ply import read_ply
 
-# What tells a folder of results from any other.
+# Files that identify a folder of results.
 FILES = ("summary.json", "trajectory.txt", "keyframes.txt", "map.ply")
-# Before the poses of each epoch, where there are several.
+# Precedes the poses of each epoch if there are several.
 EPOCH_MARK = re.compile(r"# epoch (\d{1,10}):")
 
 
 class Trajectory:
     """Poses over time: `map_from_camera` of a final trajectory, `world_from_camera` of the online one.
 
-    Iterating gives (seconds, pose).
+    Iterating yields (seconds, pose).
     """
 
     def __init__(self, table: Floats, epochs: Optional[npt.NDArray[np.int64]] = None) -> None:
-        """From rows of timestamp, tx, ty, tz, qx, qy, qz, qw, and the epoch of each."""
+        """Takes rows of timestamp, tx, ty, tz, qx, qy, qz, qw, and the epoch of each."""
         self.times: Floats = table[:, 0]
         """Seconds, of the source's clock."""
         self.positions: Floats = table[:, 1:4]
@@ -38,26 +38,26 @@ class Trajectory:
         self.quaternions: Floats = table[:, 4:8]
         """N×4: x, y, z, w."""
         self.epochs = np.zeros(len(table), dtype=np.int64) if epochs is None else epochs
-        """N: poses of different epochs have different origins and units of length; all 0 where the file marks none."""
+        """N: poses of different epochs have different origins and units of length; all 0 if the file marks no epochs."""
 
     def __len__(self) -> int:
-        """How many poses there are."""
+        """Number of poses."""
         return len(self.times)
 
     def __getitem__(self, index: int) -> Transform:
-        """One pose."""
+        """The pose at an index."""
         return Transform(self.quaternions[index], self.positions[index])
 
     def __iter__(self) -> Iterator[Any]:
-        """(seconds, pose) of each."""
+        """Iterates over (seconds, pose)."""
         return ((float(self.times[index]), self[index]) for index in range(len(self)))
 
     def matrices(self) -> Floats:
-        """N×4×4."""
+        """The poses as N×4×4 matrices."""
         return np.array([self[index].matrix for index in range(len(self))]).reshape(-1, 4, 4)
 
     def __repr__(self) -> str:
-        """How long it is."""
+        """A short description."""
         span = float(self.times[-1] - self.times[0]) if len(self) else 0.0
         return f"Trajectory({len(self)} poses over {span:.2f} s)"
 
@@ -66,7 +66,7 @@ class RunKeyframe:
     """A keyframe of a finished run."""
 
     def __init__(self, run: Run, time: float, map_from_keyframe: Transform, numbers: List[str]) -> None:
-        """From its line in keyframes.txt."""
+        """Takes the values of a line in keyframes.txt."""
         self._run = run
         self.time = time
         """Seconds, of the source's clock."""
@@ -74,17 +74,17 @@ class RunKeyframe:
         """Final pose; the scale is the keyframe's unit in map units."""
         self.keyframe_id, self.sequence, self.epoch, self.num_points = (int(number) for number in numbers[:4])
         self.state = numbers[4] if len(numbers) > 4 else ""
-        """What the mapper thought of it."""
+        """State of the map, as judged by the mapper."""
 
     @property
     def world_from_keyframe(self) -> Transform:
         """Deprecated name of `map_from_keyframe`."""
-        warnings.warn("world_from_keyframe is map_from_keyframe now", DeprecationWarning, stacklevel=2)
+        warnings.warn("world_from_keyframe is now map_from_keyframe", DeprecationWarning, stacklevel=2)
         return self.map_from_keyframe
 
     @property
     def points(self) -> npt.NDArray[np.void]:
-        """Its points in map.ply, in map units; empty where the file is missing or does not name keyframes."""
+        """Its points in map.ply, in map units; empty if the file is missing or does not name keyframes."""
         points = self._run.map_points
         if points is None:
             return np.empty(0, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
@@ -102,18 +102,18 @@ class RunKeyframe:
         return depths
 
     def __repr__(self) -> str:
-        """What identifies it."""
+        """A short description."""
         return f"RunKeyframe(id={self.keyframe_id}, {self.num_points} points, {self.state})"
 
 
 class Run:
-    """The results in a folder. A file that is missing gives None or nothing; one that is broken raises `BadRun`."""
+    """The results in a folder. A missing file gives None or an empty result; a damaged one raises `BadRun`."""
 
     def __init__(self, folder: AnyPath) -> None:
-        """Looks that it is a folder of results; files are read when they are asked for."""
+        """Checks that it is a folder of results; files are read on first use."""
         self.folder = os.path.abspath(os.fspath(folder))
         if not os.path.isdir(self.folder):
-            raise BadRun(f"{self.folder}: no such folder; `semidense run --output DIR` makes one")
+            raise BadRun(f"{self.folder}: no such folder; `semidense run --output DIR` creates one")
         if not any(os.path.exists(self._path(name)) for name in FILES):
             raise BadRun(f"{self.folder}: no results of semidense in it (none of {', '.join(FILES)})")
 
@@ -159,7 +159,7 @@ class Run:
 
     @cached_property
     def summary(self) -> Dict[str, Any]:
-        """Every figure of the run (docs/results.md); empty where the file is missing."""
+        """Every figure of the run (docs/results.md); empty if the file is missing."""
         try:
             with open(self._path("summary.json"), encoding="utf-8") as file:
                 summary = json.load(file)
@@ -178,7 +178,7 @@ class Run:
 
     @cached_property
     def trajectory_online(self) -> Optional[Trajectory]:
-        """The poses as they were published, `world_from_camera`."""
+        """The poses as published, `world_from_camera`."""
         return self._trajectory("trajectory_online.txt")
 
     @cached_property
@@ -198,12 +198,12 @@ class Run:
 
     @cached_property
     def map_points(self) -> Optional[npt.NDArray[np.void]]:
-        """The map as a structured array with what map.ply has: x, y, z in map units and more."""
+        """The map as a structured array with the properties of map.ply: x, y, z in map units and more."""
         return read_ply(self._path("map.ply"))
 
     @cached_property
     def sparse_points(self) -> Optional[npt.NDArray[np.void]]:
-        """The points that keyframes were estimated from jointly."""
+        """The points of the joint estimation of keyframes."""
         return read_ply(self._path("points.ply"))
 
     def positions(self) -> npt.NDArray[np.float32]:
@@ -214,10 +214,10 @@ class Run:
         return np.column_stack([points[axis] for axis in "xyz"])
 
     def __repr__(self) -> str:
-        """Where it is."""
+        """The folder."""
         return f"Run({self.folder!r})"
 
 
 def load(folder: AnyPath) -> Run:
-    """The results of a finished run, as `semidense run --output FOLDER` or `replay` has written them."""
+    """Loads the results of a finished run, as written by `semidense run --output FOLDER` or `replay`."""
     return Run(folder)

@@ -14,13 +14,13 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SMALL_CAMERA = ("frames=60", "width=160", "height=120", "focal_px=131.0")
-# Far above anything that is expected: it ends a test that hangs.
+# Far above any expected duration: it ends a test that hangs.
 WATCH_DOG_SECS = 120.0
 T = TypeVar("T")
 
 
 def binary() -> str:
-    """The program: `SEMIDENSE_BIN`, else what cargo has built last."""
+    """The program: `SEMIDENSE_BIN`, else the last one built by cargo."""
     named = os.environ.get("SEMIDENSE_BIN")
     if named:
         return named
@@ -32,7 +32,7 @@ def binary() -> str:
 
 
 class Rig:
-    """An instance of its own: folder, shared memory, output."""
+    """A separate instance: folder, shared memory, output."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -54,7 +54,7 @@ class Rig:
         return child
 
     def live(self) -> subprocess.Popen[bytes]:
-        """A run that continues for longer than any test."""
+        """Starts a run that lasts longer than any test."""
         return self.run("--live", "--source", "loop:1000000:30:sim")
 
     def end(self, child: subprocess.Popen[bytes]) -> None:
@@ -68,7 +68,7 @@ class Rig:
 
 
 def until(ask: Callable[[], T]) -> T:
-    """Asks again and again until there is an answer."""
+    """Calls `ask` repeatedly until there is an answer."""
     end = time.monotonic() + WATCH_DOG_SECS
     while time.monotonic() < end:
         answer = ask()
@@ -89,7 +89,7 @@ def make_rig() -> Iterator[Rig]:
 
 @pytest.fixture
 def rig() -> Iterator[Rig]:
-    """An instance where nothing runs yet."""
+    """An instance without a running process."""
     yield from make_rig()
 
 

@@ -1,4 +1,4 @@
-"""Reading an instance that runs."""
+"""Reading a running instance."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_pose_is_what_the_run_writes_down(rig: Rig) -> None:
     written = semidense.load(rig.output).trajectory_online
     assert written is not None
     both = [(seen[f"{t:.6f}"].world_from_camera, pose) for t, pose in written if f"{t:.6f}" in seen]
-    # Lockstep outruns the joining reader by a thousand poses at most, which wait for it.
+    # Lockstep outruns the joining reader by at most a thousand poses, which are kept for it.
     assert len(both) > 20
     for ours, theirs in both:
         assert np.allclose(ours.matrix, theirs.matrix, atol=1e-6)
@@ -86,7 +86,7 @@ def test_a_keyframe_is_whole_and_has_the_image_of_its_frame(running: Rig) -> Non
     depth = keyframe.depth()
     assert np.allclose(depth[points["v"], points["u"]], 1 / points["inverse_depth"])
     assert np.isnan(depth).sum() == depth.size - len(points)
-    # What is projected back lies at its pixel.
+    # Projecting the points back gives their pixels.
     projected = keyframe.points_in_keyframe() @ keyframe.intrinsics.matrix.T
     assert np.allclose(projected[:, 0] / projected[:, 2], points["u"], atol=1e-6)
     in_map = keyframe.points_in_map()
@@ -140,7 +140,7 @@ def test_what_is_held_outlives_the_reader(running: Rig) -> None:
     frame = next(semidense.frames(**options(running)))
     image, before = frame.image, frame.copy().image
     del frame
-    # Frames that come now would be written over it if it were given back.
+    # Frames that arrive now would overwrite it if it were released.
     list(itertools.islice(semidense.poses(**options(running)), 30))
     assert np.array_equal(image, before)
 

@@ -1,4 +1,4 @@
-"""The table of messages, and messages that are broken."""
+"""The table of messages, and invalid messages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from semidense.geometry import symmetric
 from semidense.messages import BrokenMessage, Frame, Graph, Health, Keyframe, Pose
 
 MESSAGES: List[Any] = [kind for kind in vars(_wire).values() if hasattr(kind, "SIZE")]
-# Written from the Rust definitions, as the table itself (tests/repository/wire_table.rs).
+# Generated from the Rust definitions, like the table itself (tests/repository/wire_table.rs).
 OFFSETS: Dict[str, Dict[str, int]] = json.loads((Path(__file__).parent / "offsets.json").read_text())
 
 

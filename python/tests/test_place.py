@@ -1,4 +1,4 @@
-"""Where an instance is looked for, and what is said where there is none."""
+"""The search for an instance, and the errors without one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Finished runs: whole, in parts and broken."""
+"""Finished runs: complete, partial and damaged."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_run_is_loaded_whole(output: Path) -> None:
     if "keyframe" in (run.map_points.dtype.names or ()):
         fullest = max(run.keyframes, key=lambda keyframe: len(keyframe.points))
         depths = fullest.depths()
-        # Points that others have refined may have got behind it, never many.
+        # A few points refined from other keyframes may have moved behind it.
         assert len(depths) > 100 and (depths > 0).mean() > 0.99
 
 
@@ -80,17 +80,17 @@ def test_broken_files_are_named(tmp_path: Path, name: str, text: str, attribute:
 
 EPOCHS = """# map_from_camera of every tracked frame
 # timestamp tx ty tz qx qy qz qw
-# epoch 0: an origin and a unit of length of its own
+# epoch 0: a separate origin and unit of length
 1 0 0 0 0 0 0 1
 2 1 0 0 0 0 0 1
-# epoch 2: an origin and a unit of length of its own
+# epoch 2: a separate origin and unit of length
 3 9 0 0 0 0 0 1
 """
 
 
 def test_poses_know_their_epoch(tmp_path: Path) -> None:
     (tmp_path / "trajectory.txt").write_text(EPOCHS)
-    # Of one epoch nothing is marked.
+    # A single epoch is not marked.
     unmarked = "".join(line + "\n" for line in EPOCHS.splitlines() if "epoch" not in line)
     (tmp_path / "trajectory_online.txt").write_text(unmarked)
     run = semidense.load(tmp_path)

@@ -57,7 +57,10 @@ pub fn open(path: &Path, topic: Option<&str>, rig: Option<&Path>) -> Result<Bag,
     };
     let rectifier = Rectifier::new(&rig, &rig_path)?;
     let notice = contents.is_unfinished.then(|| Notice {
-        text: format!("{}: ends early; it is played to its last whole part", path.display()),
+        text: format!(
+            "{}: is truncated; it is played up to its last complete chunk",
+            path.display()
+        ),
         is_warning: true,
     });
     Ok(Bag {

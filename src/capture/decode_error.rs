@@ -25,7 +25,7 @@ pub enum DecodeError {
     },
     /// A size other than the camera's.
     #[error(
-        "is {}x{} pixels where the rig says {}x{}; use the rig this sequence was recorded with",
+        "is {}x{} pixels, but the rig expects {}x{}; use the rig this sequence was recorded with",
         found.0, found.1, expected.0, expected.1
     )]
     Size {

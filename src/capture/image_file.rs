@@ -76,7 +76,7 @@ impl ImageFileReader {
         self.load(path)?;
         let decode = |bytes: &[u8]| -> Result<Image<f32>, DecodeError> {
             if !bytes.starts_with(&png_image::SIGNATURE) {
-                let found = "no PNG".to_owned();
+                let found = "another format".to_owned();
                 return Err(DecodeError::Samples { found, expected: "a 16-bit grey PNG" });
             }
             let steps = png_image::decode_u16(bytes, width, height)?;

@@ -128,7 +128,7 @@ fn errors_name_the_file_and_what_to_do() {
         (None, "frame.png: cannot be read"),
         (Some(&b""[..]), "is empty; copy the file again"),
         (Some(&b"GIF89a.."[..]), "convert it to one of them"),
-        (Some(&small[..small.len() - 9]), "is 8x16 pixels where the rig says 16x16"),
+        (Some(&small[..small.len() - 9]), "is 8x16 pixels, but the rig expects 16x16"),
         (Some(&[0xff, 0xd8, 0xff, 0xe0][..]), "is a damaged JPEG (it ends before its last marker)"),
     ] {
         let message = read(bytes);

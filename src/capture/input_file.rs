@@ -14,7 +14,7 @@ pub fn read_into(path: &Path, max_bytes: u64, bytes: &mut Vec<u8>) -> io::Result
     if length > max_bytes {
         bytes.clear();
         return Err(io::Error::other(format!(
-            "it is larger than the {} MB that such a file can have",
+            "it is larger than the limit of {} MB",
             max_bytes.div_ceil(1 << 20)
         )));
     }

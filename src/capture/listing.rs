@@ -60,7 +60,7 @@ impl Row<'_> {
         let quaternion_xyzw =
             [self.number(qx)?, self.number(qy)?, self.number(qz)?, self.number(qw)?];
         SE3::try_from_parts(quaternion_xyzw, translation).ok_or_else(|| {
-            self.error("its quaternion has no length, so it is not a rotation; remove the line")
+            self.error("its quaternion has zero length, so it is not a rotation; remove the line")
         })
     }
 

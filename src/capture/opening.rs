@@ -95,7 +95,7 @@ fn rig_conflict(name: &SourceName, rig: Option<&Path>) -> Option<String> {
     };
     (shift_px > MAX_SHIFT_PX).then(|| {
         format!(
-            "the camera of {} and that of {} {difference}; the first is used, leave out --rig for the second",
+            "the camera of {} and that of {} {difference}; the first is used; omit --rig to use the second",
             rig.display(),
             own_path.display()
         )

@@ -160,8 +160,8 @@ impl Rig {
             return None;
         }
         Some(format!(
-            "fx = {} and fy = {} with {}x{} pixels are a field of view of {across:.1}° x {down:.1}°, where cameras have {} to {}°: \
-             are they in pixels, and of this image size?",
+            "fx = {} and fy = {} with {}x{} pixels give a field of view of {across:.1}° x {down:.1}°; cameras usually have {} to {}°: \
+             are they in pixels, and for this image size?",
             k.fx,
             k.fy,
             k.width,

@@ -26,7 +26,7 @@ pub struct RosImage<'a> {
 pub enum RosImageError {
     /// A format without grey values, or an unknown one.
     #[error(
-        "encoding `{0}`: known are mono8, mono16, rgb8, bgr8, rgba8, bgra8, 8UC1, 8UC3, 8UC4, 16UC1, rgb16, bgr16, bayer_*8, bayer_*16, yuv422, yuv422_yuy2, uyvy, yuyv, nv12, nv21, nv24"
+        "encoding `{0}` is not supported; supported are mono8, mono16, rgb8, bgr8, rgba8, bgra8, 8UC1, 8UC3, 8UC4, 16UC1, rgb16, bgr16, bayer_*8, bayer_*16, yuv422, yuv422_yuy2, uyvy, yuyv, nv12, nv21, nv24"
     )]
     Encoding(String),
     /// An invalid size, or one other than the buffer's.

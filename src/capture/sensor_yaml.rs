@@ -43,12 +43,12 @@ pub fn parse(path: &Path, text: &str) -> Result<SensorYaml, SourceError> {
         entries.get(key).ok_or_else(|| SourceError::Line {
             path: path.to_owned(),
             line: 1,
-            problem: format!("the key `{key}` is missing; take the file of the original recording"),
+            problem: format!("the key `{key}` is missing; use the file of the original recording"),
         })
     };
     let model = get("camera_model")?;
     if model.value != "pinhole" {
-        let problem = format!("camera_model is `{}`; only `pinhole` is understood", model.value);
+        let problem = format!("camera_model is `{}`; only `pinhole` is supported", model.value);
         return Err(model.row.error(problem));
     }
     let coefficients = get("distortion_coefficients")?.list()?;
@@ -59,7 +59,7 @@ pub fn parse(path: &Path, text: &str) -> Result<SensorYaml, SourceError> {
         "none" => LensModel::Pinhole,
         other => {
             return Err(lens.row.error(format!(
-                "distortion_model is `{other}`; understood are radial-tangential, equidistant, none"
+                "distortion_model is `{other}`; supported are radial-tangential, equidistant, none"
             )));
         }
     };

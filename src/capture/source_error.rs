@@ -31,7 +31,7 @@ pub enum SourceError {
     },
     /// A video, which must first be converted to a folder of images.
     #[error(
-        "source `{path}`: by its name this is a video: make a folder of images and times from it with the command below, \
+        "source `{path}`: this looks like a video file: make a folder of images and times from it with the command below, \
          then name that folder, with --rig FILE for the camera"
     )]
     Video {

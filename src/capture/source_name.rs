@@ -390,7 +390,7 @@ mod tests {
     fn errors_for_files_say_what_to_do_with_them() {
         let folder = tempfile::tempdir().unwrap();
         for (name, words) in [
-            ("it's.MP4", "by its name this is a video"),
+            ("it's.MP4", "this looks like a video file"),
             ("a.zip", "unpack"),
             ("a.bag", "ROS bag"),
             ("rgb.txt", "name its folder"),

@@ -152,7 +152,7 @@ impl StreamSource {
         }
         if self.is_silent(now) {
             let seconds = self.stall_s;
-            return Ok(Arrival::Absent(format!("its sender sends no frame for {seconds} s")));
+            return Ok(Arrival::Absent(format!("its sender has sent no frame for {seconds} s")));
         }
         Ok(Arrival::Nothing)
     }
@@ -164,7 +164,7 @@ impl StreamSource {
     /// One sender at a time: another only replaces one that has gone silent.
     fn take_sender(&mut self, stream: UnixStream, now: i64) {
         if self.stream.is_some() && !self.is_silent(now) {
-            self.remark("another program wants to send frames too; it is refused".to_owned());
+            self.remark("another program tried to send frames and was refused".to_owned());
             return;
         }
         self.reader.restart();
@@ -189,7 +189,7 @@ impl StreamSource {
                     self.losses.broken += 1;
                     if matches!(fault, StreamFault::Size { .. }) && !self.has_streamed {
                         return Err(
-                            self.failed(format!("{fault}; name the rig of that size with --rig"))
+                            self.failed(format!("{fault}; name a rig of that size with --rig"))
                         );
                     }
                     self.send_away(Some(fault.to_string()));

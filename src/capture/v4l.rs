@@ -56,7 +56,7 @@ pub fn open(
     params: &CameraParams,
 ) -> Result<CameraSource<impl VideoSystem + use<>>, SourceError> {
     const NO_RIG: &str = "a camera needs a rig file with its calibration: name it with --rig FILE (for a first try at \
-                          640x480, webcam.toml in config/rigs or /usr/share/semidense/rigs will do)";
+                          640x480, webcam.toml in config/rigs or /usr/share/semidense/rigs is enough)";
     let path = rig.ok_or_else(|| SourceError::Camera {
         name: format!("v4l:{name}"),
         reason: NO_RIG.to_owned(),

@@ -1,4 +1,4 @@
-//! `semidense bench`: the latency of poses, idle and under load, and how a long run behaves.
+//! `semidense bench`: pose latency, idle and under load, and the behaviour of a long run.
 
 use std::ffi::OsString;
 use std::fs;
@@ -37,16 +37,16 @@ enum Bench {
     Soak(SoakArguments),
 }
 
-/// Load next to the pipeline.
+/// Load alongside the pipeline.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Beside {
-    /// Each of the following in turn
+    /// Each of the following, one after another
     All,
     /// No load
     Idle,
     /// One busy thread per CPU
     BusyCpus,
-    /// A mapper with more work than it can do
+    /// A mapper with more work than it can keep up with
     SaturatedMapper,
     /// A subscriber that reads slowly
     SlowReader,
@@ -69,7 +69,7 @@ enum RealTime {
 /// without real-time scheduling
 #[derive(Debug, Args)]
 pub struct LatencyArguments {
-    /// Source to play back and forth; the default room is rendered first
+    /// Source to play back and forth; the default, a simulated room, is rendered first
     #[arg(long, value_name = "SOURCE", default_value = "sim")]
     source: OsString,
     /// Frames per second
@@ -78,7 +78,7 @@ pub struct LatencyArguments {
     /// Duration of each trial in seconds
     #[arg(long, value_name = "SECONDS", default_value_t = 30.0)]
     seconds: f64,
-    /// Load next to the pipeline
+    /// Load alongside the pipeline
     #[arg(long, value_enum, default_value_t = Beside::All)]
     load: Beside,
     /// Scheduling of capture and tracker
@@ -89,16 +89,16 @@ pub struct LatencyArguments {
     json: bool,
 }
 
-/// Run a source back and forth for long and report memory, time per frame and keyframes over time
+/// Run a source back and forth for a long time and report memory, time per frame and keyframes over time
 ///
-/// The table has each quantity's mean over the second and the last quarter of the run, and the slope per hour
-/// after the first quarter.
+/// The table lists each quantity's mean over the second and the last quarter of the run, and its slope per
+/// hour after the first quarter.
 #[derive(Debug, Args)]
 pub struct SoakArguments {
     /// Source to play back and forth: its first 640 MB, 2184 frames at 640x480 (more than a round of the default flat)
     #[arg(long, value_name = "SOURCE", default_value = "sim:flat")]
     source: OsString,
-    /// Number of frames; 108000 are an hour at 30 Hz
+    /// Number of frames; 108000 is an hour at 30 Hz
     #[arg(long, value_name = "N", default_value_t = 108_000)]
     frames: u64,
     /// Frames per second
@@ -110,7 +110,7 @@ pub struct SoakArguments {
     /// Time from one sample to the next in seconds
     #[arg(long, value_name = "SECONDS", default_value_t = 10.0)]
     every: f64,
-    /// File for the samples as comma-separated values
+    /// Write the samples to FILE as comma-separated values
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
     /// Print the trends as JSON
@@ -118,12 +118,12 @@ pub struct SoakArguments {
     json: bool,
 }
 
-/// Most frames of a trial: a day at 60 Hz; poses are kept until its end.
+/// Upper limit for the frames of a trial: a day at 60 Hz; poses are kept until its end.
 const MAX_FRAMES: f64 = 5_184_000.0;
 /// Rates at which a source can be repeated.
 const RATES_HZ: RangeInclusive<f64> = 0.01..=10_000.0;
 
-/// Runs it.
+/// Runs the chosen benchmark.
 pub fn run(
     config: &Config,
     common: &CommonArguments,
@@ -142,7 +142,7 @@ fn run_soak(
     log: &ErrorLog,
     arguments: &SoakArguments,
 ) -> CommandResult {
-    /// From a sample with each report of the processes to one an hour.
+    /// From one sample per report of the processes to one per hour.
     const PERIODS_S: RangeInclusive<f64> = 1.0..=3600.0;
     let (frames, rate_hz) = (arguments.frames, arguments.fps);
     if !(1..=MAX_FRAMES as u64).contains(&frames) {
@@ -162,7 +162,7 @@ fn run_soak(
     let options = common.without_instance().to_arguments();
     let output = std::env::temp_dir().join(format!("semidense-soak-{}", std::process::id()));
     fs::create_dir(&output)
-        .map_err(|error| format!("{}: cannot be made ({error})", output.display()))?;
+        .map_err(|error| format!("{}: cannot be created ({error})", output.display()))?;
     let journal = journal_options(config, &source, None, &output);
     let soaked = Soak { frames, rate_hz, mode, period, journal };
     let samples =
@@ -179,7 +179,7 @@ fn run_soak(
     Ok(if shutdown.is_requested() { ExitCode::from(INTERRUPTED) } else { ExitCode::SUCCESS })
 }
 
-/// The trends as lines.
+/// Formats the trends as a table.
 fn trend_table(samples: &[Sample], trends: &[Trend]) -> String {
     let Some(last) = samples.last().filter(|_| !trends.is_empty()) else {
         return "too short for a trend: fewer than four samples\n".to_owned();
@@ -255,7 +255,7 @@ fn real_times(real_time: RealTime) -> Vec<bool> {
     }
 }
 
-/// The measurements as lines; times in milliseconds.
+/// Formats the measurements as a table; times in milliseconds.
 fn table(measurements: &[Measurement]) -> String {
     let mut lines = vec![format!(
         "{:16} {:9} {:>6} {:>28} {:>28} {:>5} {:>5} {:>6} {:>9}",

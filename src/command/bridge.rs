@@ -1,4 +1,4 @@
-//! `semidense view`, `record`, `ros2`, `zenoh`: hand over to `semidense-bridge`, a program and package of its own.
+//! `semidense view`, `record`, `ros2`, `zenoh`: hand over to `semidense-bridge`, a separate program and package.
 
 use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
@@ -10,10 +10,10 @@ use clap::Args;
 use crate::capture::stream::INSTALL_BRIDGE;
 use crate::command::{CommandResult, CommonArguments};
 
-/// The program that they are in.
+/// The program that implements these commands.
 const PROGRAM: &str = "semidense-bridge";
 
-/// What goes to the program as it stands: its own command line explains and checks it.
+/// Arguments passed on unchanged: the bridge's own command line explains and checks them.
 #[derive(Debug, Args)]
 #[command(disable_help_flag = true)]
 pub struct BridgeArguments {
@@ -22,12 +22,12 @@ pub struct BridgeArguments {
     arguments: Vec<OsString>,
 }
 
-/// Why the program cannot be handed over to.
+/// Why the bridge cannot be run.
 #[derive(Debug, thiserror::Error)]
 pub enum BridgeError {
-    /// It is nowhere.
+    /// It was not found.
     #[error(
-        "`semidense {command}` needs {PROGRAM}, which is neither beside {own} nor on the PATH: {INSTALL_BRIDGE}"
+        "`semidense {command}` needs {PROGRAM}, which is neither next to {own} nor on the PATH: {INSTALL_BRIDGE}"
     )]
     Missing {
         /// The command that was given.
@@ -35,22 +35,22 @@ pub enum BridgeError {
         /// This program.
         own: PathBuf,
     },
-    /// It has no `--set`: the subcommand.
+    /// It has no `--set`; names the subcommand.
     #[error(
-        "`semidense {0}` has no --set: write it into a configuration file and name that with --config"
+        "`semidense {0}` has no --set: set it in a configuration file and name that with --config"
     )]
     Set(&'static str),
-    /// It does not start.
+    /// It cannot be started.
     #[error("cannot start {program}: {source}")]
     Start {
         /// The program.
         program: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
 }
 
-/// Becomes `semidense-bridge COMMAND ARGUMENTS`, with the options that every command has.
+/// Replaces this process with `semidense-bridge COMMAND ARGUMENTS`, with the options common to all commands.
 pub fn run(
     common: &CommonArguments,
     command: &'static str,
@@ -61,7 +61,7 @@ pub fn run(
     }
     let program = bridge(command)?;
     let source = Command::new(&program)
-        // Its help and its errors then name the command that was typed.
+        // So that its help and its errors name the command that was typed.
         .arg0("semidense")
         .args(common.of_bridge())
         .arg(command)
@@ -70,13 +70,13 @@ pub fn run(
     Err(BridgeError::Start { program, source }.into())
 }
 
-/// The program, for `command`.
+/// Path of the bridge, for an error that names `command`.
 pub fn bridge(command: &str) -> Result<PathBuf, BridgeError> {
     let own = std::env::current_exe().unwrap_or_else(|_| PathBuf::from("semidense"));
     program(&own).ok_or_else(|| BridgeError::Missing { command: command.to_owned(), own })
 }
 
-/// The program: beside our own, which was installed or built with it, else on the path.
+/// Path of the bridge: next to our own program, with which it was installed or built, else on the `PATH`.
 fn program(own: &Path) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let beside = own.parent().map(Path::to_owned);
@@ -92,7 +92,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_program_beside_ours_comes_first() {
+    fn the_program_next_to_ours_takes_precedence() {
         let folder = tempfile::tempdir().unwrap();
         let own = folder.path().join("semidense");
         let beside = folder.path().join(PROGRAM);
@@ -102,10 +102,10 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_program_is_said_alike_by_whoever_needs_it() {
+    fn the_error_for_a_missing_program_names_both_places_and_the_package() {
         let error = BridgeError::Missing { command: "ros2".to_owned(), own: "/x/semidense".into() };
         let error = error.to_string();
-        assert!(error.contains("neither beside /x/semidense nor on the PATH"), "{error}");
+        assert!(error.contains("neither next to /x/semidense nor on the PATH"), "{error}");
         assert!(error.contains(INSTALL_BRIDGE) && INSTALL_BRIDGE.contains(PROGRAM), "{error}");
     }
 }

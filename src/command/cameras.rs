@@ -1,4 +1,4 @@
-//! `semidense cameras`: the cameras of this machine and what they offer.
+//! `semidense cameras`: lists the cameras of this machine and what they offer.
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -11,8 +11,8 @@ use crate::command::print::print_as;
 
 /// List the cameras of this machine: names, formats, sizes, rates and controls
 ///
-/// `v4l:` takes a camera's path, its number or one of its names. A usb-… name stays with the camera, a
-/// pci-… name with the port. Formats in parentheses are not supported.
+/// `v4l:` takes a camera's path, its number or one of its names. A usb-… name follows the camera, a pci-…
+/// name the port. Formats in parentheses are not supported.
 #[derive(Debug, Args)]
 pub struct CamerasArguments {
     /// Print the list as JSON
@@ -20,7 +20,7 @@ pub struct CamerasArguments {
     json: bool,
 }
 
-/// Runs it.
+/// Prints the list.
 pub fn run(arguments: CamerasArguments) -> CommandResult {
     let found = cameras(Path::new("/dev"));
     const NONE: &str =

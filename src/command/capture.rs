@@ -1,4 +1,4 @@
-//! `semidense capture`: frames into shared memory.
+//! `semidense capture`: publishes frames in shared memory.
 
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -16,10 +16,10 @@ use crate::service::mode::Mode;
 use crate::service::run_error::RunError;
 use crate::service::shutdown::Shutdown;
 
-/// Send frames from a source into shared memory
+/// Publish the frames of a source in shared memory
 #[derive(Debug, Args)]
 pub struct CaptureArguments {
-    /// Where frames come from and how the camera is.
+    /// Where frames come from, and the camera's calibration.
     #[command(flatten)]
     pub source: SourceArguments,
     /// Lockstep or live.
@@ -39,22 +39,22 @@ pub struct SourceArguments {
                 frames at HZ [default: capture.source of the configuration, which is sim]"
     )]
     source: Option<OsString>,
-    /// The same as SOURCE, as scripts of earlier versions have it
+    /// The same as SOURCE, for scripts written for earlier versions
     #[arg(long = "source", value_name = "SOURCE", hide = true, conflicts_with = "source")]
     source_option: Option<OsString>,
     /// Rig file with the camera's calibration; required for a camera (v4l) [default: capture.rig of the
     /// configuration, for the source configured there]
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
-    /// Stop with an error at a damaged or missing image of a recording; otherwise it is left out, counted and
-    /// named [default: capture.strict of the configuration]
+    /// Stop with an error at a damaged or missing image of a recording; otherwise such an image is skipped,
+    /// counted and reported [default: capture.strict of the configuration]
     #[arg(long)]
     pub strict: bool,
 }
 
 impl SourceArguments {
-    /// Source and rig: those of the command line, else the configuration's. A source that the command line names
-    /// does not take the configuration's rig, which is another camera's.
+    /// Source and rig from the command line, else from the configuration. A source named on the command line
+    /// does not use the configured rig, which belongs to another camera.
     pub fn source_and_rig(
         self,
         config: &CaptureConfig,
@@ -89,7 +89,7 @@ pub struct ModeArguments {
 }
 
 impl ModeArguments {
-    /// The mode asked for, or the usual one.
+    /// The requested mode, or the usual one.
     pub fn mode(self, usual: Mode) -> Mode {
         match (self.lockstep, self.live) {
             (true, _) => Mode::Lockstep,
@@ -104,7 +104,7 @@ pub fn usual_mode(source: &SourceName) -> Mode {
     if source.is_camera() { Mode::Live } else { Mode::Lockstep }
 }
 
-/// Runs it.
+/// Runs the capture process.
 pub fn run(config: &Config, arguments: CaptureArguments) -> CommandResult {
     let mut config = config.clone();
     config.capture.strict |= arguments.source.strict;

@@ -1,4 +1,4 @@
-//! `semidense config`: the effective configuration, and where each value comes from.
+//! `semidense config`: prints the effective configuration and the origin of each value.
 
 use std::process::ExitCode;
 
@@ -11,8 +11,8 @@ use crate::service::config::{Config, KeyInForce, Origin};
 
 /// Print the effective configuration, and where each value comes from
 ///
-/// What is printed can be saved as a configuration file. The keys, their units and what each is for are explained in
-/// the shipped file, config/semidense.toml or /etc/semidense/semidense.toml.
+/// The output can be saved as a configuration file. The shipped file, config/semidense.toml or
+/// /etc/semidense/semidense.toml, explains each key, its unit and its purpose.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     semidense config                                     # the keys that a user may want to set\n  \
@@ -20,10 +20,10 @@ use crate::service::config::{Config, KeyInForce, Origin};
     semidense config --config config/presets/webcam.toml --changed\n  \
     semidense config --all --set mapper.threads=2 > my.toml")]
 pub struct ConfigArguments {
-    /// Print the expert keys too
+    /// Print expert keys as well
     #[arg(long)]
     all: bool,
-    /// Print only the keys whose value is not the built-in one
+    /// Print only the keys whose value differs from the built-in one
     #[arg(long)]
     changed: bool,
     /// Print JSON: an object with value, built_in and origin for each key
@@ -31,7 +31,7 @@ pub struct ConfigArguments {
     json: bool,
 }
 
-/// Runs it.
+/// Prints the keys.
 pub fn run(common: &CommonArguments, arguments: &ConfigArguments) -> CommandResult {
     let keys = Config::keys_in_force(common.file().as_deref(), &common.settings())?;
     let wanted = arguments.wanted(&keys);
@@ -44,7 +44,7 @@ pub fn run(common: &CommonArguments, arguments: &ConfigArguments) -> CommandResu
 }
 
 impl ConfigArguments {
-    /// The keys that are printed.
+    /// The keys to print.
     fn wanted<'a>(&self, keys: &'a [KeyInForce]) -> Vec<&'a KeyInForce> {
         let is_wanted = |key: &&KeyInForce| match self.changed {
             true => key.built_in.is_some(),
@@ -54,8 +54,8 @@ impl ConfigArguments {
     }
 }
 
-/// `key = value   # origin`, below the table that the key belongs to. A table may be opened once, and keys of none
-/// must come before the first.
+/// `key = value   # origin`, below the table that the key belongs to. A table may be opened only once, and
+/// keys without a table must precede the first.
 fn as_toml(keys: &[&KeyInForce]) -> String {
     /// Column of the origins where lines are short enough.
     const ORIGIN_COLUMN: usize = 40;
@@ -87,7 +87,7 @@ fn name_of(origin: &Origin) -> String {
 }
 
 fn as_json(key: &KeyInForce) -> (String, Value) {
-    // TOML values that JSON has, too, but for numbers that are none.
+    // TOML values that JSON has too, except for numbers that are not finite.
     let value =
         |text: &str| -> Value { serde_json::from_str(text).unwrap_or_else(|_| json!(text)) };
     let object = json!({
@@ -103,7 +103,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_printed_can_be_saved_and_read_again() {
+    fn the_output_can_be_saved_and_read_again() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("robot.toml");
         std::fs::write(&file, "root = \"/tmp/robot\"\n[capture.camera]\nrate_hz = 15.0\n").unwrap();
@@ -111,7 +111,7 @@ mod tests {
         let expert = ["capture.connect_timeout_s=7.5", "mapping.min_gradient=6.5"];
         let texts = |keys: &[&str]| keys.iter().map(|&key| key.to_owned()).collect::<Vec<_>>();
         let both = texts(&[&user[..], &expert].concat());
-        // Expert keys are printed on request alone.
+        // Expert keys are printed only on request.
         for (all, changed, file, settings) in [
             (false, false, Some(file.as_path()), texts(&user)),
             (true, false, Some(file.as_path()), both.clone()),

@@ -1,4 +1,4 @@
-//! `semidense doctor`: what on this machine will cost latency or fail.
+//! `semidense doctor`: checks this machine for anything that will cost latency or fail.
 
 use std::process::ExitCode;
 
@@ -9,10 +9,10 @@ use crate::command::print::print_as;
 use crate::service::config::Config;
 use crate::service::doctor::{Finding, Machine, Severity, examine};
 
-/// Check what on this machine will cost latency or fail, and say how to fix it
+/// Check this machine for anything that will cost latency or fail, and suggest fixes
 ///
-/// Checks limits, CPU governor, real-time throttling, clock source, shared memory, permissions and
-/// cameras. Exits with 1 if something will not work.
+/// Checks limits, CPU governor, real-time throttling, clock source, shared memory, permissions and cameras.
+/// Exits with 1 if something will not work.
 #[derive(Debug, Args)]
 pub struct DoctorArguments {
     /// Print the findings as JSON
@@ -20,7 +20,7 @@ pub struct DoctorArguments {
     json: bool,
 }
 
-/// Runs it.
+/// Prints the findings.
 pub fn run(config: &Config, arguments: DoctorArguments) -> CommandResult {
     let findings = examine(&Machine::default(), config);
     print_as(arguments.json, &findings, |findings| findings.iter().map(line).collect())?;

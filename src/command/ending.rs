@@ -1,4 +1,4 @@
-//! How a run, a replay or a recovery ends: results written, what is said, exit code.
+//! The end of a run, a replay or a recovery: written results, final output, exit code.
 
 use std::error::Error;
 use std::path::Path;
@@ -24,21 +24,21 @@ use crate::service::results::set::has_tracked_set;
 use crate::service::results::summary::Summary;
 use crate::service::results::summary_text::{recovery_text, refused_text, summary_text};
 
-/// Where and how results are given out.
+/// Where and how results are written.
 pub struct Ending<'a> {
-    /// Their folder.
+    /// The results folder.
     pub output: &'a OutputFolder,
-    /// How they are evaluated.
+    /// Settings of the evaluation.
     pub config: &'a Config,
     /// Whether the summary is printed as JSON.
     pub json: bool,
-    /// Writes what belongs to the set besides, into the folder that it is given.
+    /// Writes further files of the result set into the given folder.
     pub write_more: &'a (dyn Fn(&Path) -> Result<(), ResultsError> + Sync),
 }
 
 impl Ending<'_> {
-    /// Writes the results of `record` and says what there is to say. A run that has tracked nothing does not
-    /// replace one that has. The journal goes when its run is written.
+    /// Writes the results of `record` and prints the outcome. A run that tracked nothing does not replace one
+    /// that did. The journal is removed once the results of its run are written.
     pub fn finish(
         &self,
         record: &RunRecord,
@@ -53,7 +53,7 @@ impl Ending<'_> {
         })?;
         progress.finish();
         let is_tracked = results.summary.frames.frames_tracked > 0;
-        // Poses without a map, of a run that failed: a full disk, a mapper that is gone.
+        // A failed run with poses but no map: a full disk, a mapper that has died.
         let is_torn =
             matches!(record.ended, EndOfRun::Failed(_)) && results.summary.point_counts.points == 0;
         let keeps_earlier = (!is_tracked || is_torn) && has_tracked_set(output);
@@ -93,13 +93,13 @@ impl Ending<'_> {
         self.conclude(&record.ended, &results.summary, &where_to)
     }
 
-    /// What is said last, and the exit code.
+    /// Prints the final message and chooses the exit code.
     fn conclude(&self, ended: &EndOfRun, summary: &Summary, where_to: &str) -> CommandResult {
         let untracked = summary.untracked.as_deref();
         if let EndOfRun::Failed(cause) = ended {
             return Err(cause.as_str().into());
         }
-        // Where standard output has the summary as JSON, it does not say where the results are.
+        // With the summary as JSON, standard output does not name the results folder.
         let place = Some(where_to).filter(|_| self.json);
         if let Some(words) = last_words(ended, untracked, place) {
             note(&words);
@@ -111,7 +111,7 @@ impl Ending<'_> {
         })
     }
 
-    /// Prints the figures, and warnings of what the user can change.
+    /// Prints the figures, and warnings about what the user can change.
     fn print_summary(&self, summary: &Summary) -> Result<(), Box<dyn Error>> {
         print_as(self.json, summary, summary_text)?;
         if self.json {
@@ -119,7 +119,7 @@ impl Ending<'_> {
         }
         let Summary { mode, frames_in, frames_skipped_by_mapper: skipped, .. } = *summary;
         let calibration = calibration_warning(summary.whitened_residual_median);
-        // Where nothing was tracked, the reason follows.
+        // If nothing was tracked, the reason is printed later.
         let mapping =
             mapping_warning(mode, skipped, frames_in).filter(|_| summary.untracked.is_none());
         for warning in calibration.into_iter().chain(mapping) {
@@ -129,7 +129,7 @@ impl Ending<'_> {
     }
 }
 
-/// How a run ended that did not go as it should, and the `place` of its results.
+/// How a run ended if not normally, and the `place` of its results.
 fn last_words(ended: &EndOfRun, untracked: Option<&str>, place: Option<&str>) -> Option<String> {
     let how = match (ended, untracked) {
         (EndOfRun::Interrupted, None) => "interrupted".to_owned(),
@@ -145,7 +145,7 @@ fn last_words(ended: &EndOfRun, untracked: Option<&str>, place: Option<&str>) ->
     })
 }
 
-/// What is said where results cannot be written: nothing is lost.
+/// The message for results that could not be written: nothing is lost.
 fn not_written(error: &ResultsError, output: &Path, journal: Option<&Journal>) -> String {
     let Some(journal) = journal else { return error.to_string() };
     format!(
@@ -156,7 +156,7 @@ fn not_written(error: &ResultsError, output: &Path, journal: Option<&Journal>) -
     )
 }
 
-/// What to type to recover the journal in a folder, beside results that are there already or over them.
+/// The command that recovers the journal in a folder, next to existing results or over them.
 fn recover_command(output: &Path, beside: bool) -> String {
     let quoted = |path: String| {
         let is_plain = |c: char| c.is_alphanumeric() || "/._-".contains(c);
@@ -170,7 +170,7 @@ fn recover_command(output: &Path, beside: bool) -> String {
     format!("semidense recover {}{}", quoted(path), if beside { &elsewhere } else { "" })
 }
 
-/// Says where the journals of killed runs are and what to type.
+/// Prints where the journals of killed runs are and the command that recovers them.
 pub fn note_unfinished(found: &[Unfinished]) {
     for unfinished in found {
         note(&format!(
@@ -181,7 +181,7 @@ pub fn note_unfinished(found: &[Unfinished]) {
     }
 }
 
-/// The journal of a replay that begins, from which it can be recovered where it is killed.
+/// Journal of a replay that is starting, from which it can be recovered if it is killed.
 pub fn journal_options(
     config: &Config,
     source: &SourceName,

@@ -1,4 +1,4 @@
-//! `semidense evaluate`: a trajectory against ground truth.
+//! `semidense evaluate`: compares a trajectory with ground truth.
 
 use std::error::Error;
 use std::io::Write as _;
@@ -18,7 +18,7 @@ use crate::slam::evaluation::epochs::evaluate_epochs;
 use crate::slam::evaluation::umeyama::TrajectoryAlignment;
 use crate::slam::trajectory::{EpochPose, StampedPose, by_epoch};
 
-/// What is fitted before positions are compared.
+/// Transformation fitted before positions are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Align {
     /// Rotation, translation and scale
@@ -31,20 +31,20 @@ enum Align {
 
 /// Compare a trajectory with ground truth: absolute and relative errors, scale
 ///
-/// Files are in TUM layout (timestamp tx ty tz qx qy qz qw) or EuRoC ground truth (CSV). EuRoC poses are
+/// Files are in TUM format (timestamp tx ty tz qx qy qz qw) or EuRoC ground truth (CSV). EuRoC poses are
 /// those of the body; they are moved to the camera with T_BS of cam0/sensor.yaml, as is an estimate in that
-/// layout. Each pose of the shorter trajectory is compared with the pose of the longer one that is nearest in
-/// time; the figures are those of the Python package evo.
+/// format. Each pose of the shorter trajectory is compared with the pose of the longer one that is nearest in
+/// time; the figures match those of the Python package evo.
 ///
-/// Where the estimate marks several epochs (`# epoch N: …`, as trajectory.txt of a run does), each has an origin and a unit
-/// of its own: it is aligned and judged by itself, and the total is over the matched poses of all epochs. One with too few
-/// poses to align is named and left out.
+/// If the estimate marks several epochs (`# epoch N: …`, as in the trajectory.txt of a run), each has its own
+/// origin and unit: epochs are aligned and evaluated separately, and the total is over the matched poses of
+/// all of them. An epoch with too few poses to align is named and left out.
 #[derive(Debug, Args)]
 pub struct EvaluateArgs {
     /// Estimated trajectory
     #[arg(value_name = "EST")]
     estimate: PathBuf,
-    /// True trajectory
+    /// Ground-truth trajectory
     #[arg(value_name = "GT")]
     truth: PathBuf,
     /// Alignment before positions are compared
@@ -53,11 +53,11 @@ pub struct EvaluateArgs {
     /// Largest difference between matched time stamps, in seconds
     #[arg(long, value_name = "SECS", default_value_t = 0.02, value_parser = parse_difference)]
     max_difference: f64,
-    /// sensor.yaml of the camera, if it is not next to EuRoC ground truth; with ground truth in another layout it
-    /// also says that its poses are those of the body
+    /// sensor.yaml of the camera, if it is not next to EuRoC ground truth; with ground truth in another
+    /// format, also declares its poses to be those of the body
     #[arg(long, value_name = "FILE")]
     sensor: Option<PathBuf>,
-    /// Print the figures as JSON, with the keys of summary.json: of the total, and in `epochs` of each epoch
+    /// Print the figures as JSON, with the keys of summary.json: the total, and one entry in `epochs` for each epoch
     #[arg(long)]
     json: bool,
     /// Write a plot of both trajectories and the error
@@ -65,7 +65,7 @@ pub struct EvaluateArgs {
     plot: Option<PathBuf>,
 }
 
-/// A difference of stamps: an hour is longer than any clock error worth bridging.
+/// Parses a difference of stamps: an hour is longer than any clock error worth bridging.
 fn parse_difference(text: &str) -> Result<f64, String> {
     const LONGEST_SECS: f64 = 3600.0;
     let secs: f64 = text.parse().map_err(|_| "expected seconds, such as 0.02".to_owned())?;
@@ -102,22 +102,22 @@ pub fn run(args: &EvaluateArgs) -> Result<ExitCode, Box<dyn Error>> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// The poses of the truth, which must have one origin and one unit.
+/// The poses of the ground truth, which must have one origin and one unit.
 fn one_path(truth: &[EpochPose], path: &Path) -> Result<Vec<StampedPose>, String> {
     let epochs = by_epoch(truth);
     match epochs.len() {
         0 | 1 => Ok(epochs.into_values().flatten().collect()),
         count => Err(format!(
-            "{} marks {count} epochs, each with an origin and a unit of its own, and is no ground truth: keep the \
+            "{} marks {count} epochs, each with a separate origin and unit, and cannot be ground truth: keep the \
              lines of one epoch",
             path.display()
         )),
     }
 }
 
-/// Moves poses of the body to the camera on it: an estimate is the camera's, and seen from another
-/// place, or along other axes, the same motion has another relative error. EuRoC's poses are the body's, and
-/// so is ground truth of any layout for which `--sensor` is given.
+/// Moves body poses to the camera on the body: the estimate is the camera's, and seen from another position,
+/// or along other axes, the same motion has a different relative error. EuRoC poses are the body's, and so is
+/// ground truth in any format for which `--sensor` is given.
 fn move_to_camera(
     estimate: &mut TrajectoryFile,
     truth: &mut TrajectoryFile,
@@ -128,7 +128,7 @@ fn move_to_camera(
         if truth.is_euroc {
             note(&format!(
                 "warning: {} holds poses of the body and there is no cam0/sensor.yaml next to its folder: relative \
-                 errors are not about the camera's axes; name the file with --sensor",
+                 errors do not refer to the camera's axes; name the file with --sensor",
                 args.truth.display()
             ));
         }

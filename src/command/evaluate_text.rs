@@ -1,4 +1,4 @@
-//! How `semidense evaluate` prints its figures: as a table, or as JSON with the keys of `summary.json`.
+//! Output of `semidense evaluate`: a table, or JSON with the keys of `summary.json`.
 
 use serde::Serialize;
 
@@ -8,10 +8,10 @@ use crate::slam::evaluation::epochs::{EpochEvaluation, EpochsEvaluation};
 use crate::slam::evaluation::statistics::ErrorStatistics;
 use crate::slam::evaluation::umeyama::TrajectoryAlignment;
 
-/// The figures of all epochs together, and of each.
+/// The figures of all epochs together, and of each one.
 #[derive(Debug, Serialize)]
 struct EvaluationSummary {
-    /// Over all matched poses; `ate_scale` is null where several epochs have one each.
+    /// Over all matched poses; `ate_scale` is null where several epochs each have their own.
     #[serde(flatten)]
     total: TrajectorySummary,
     epochs: Vec<EpochSummary>,
@@ -22,9 +22,9 @@ struct EvaluationSummary {
 struct EpochSummary {
     epoch: u32,
     poses: usize,
-    /// Why it is not part of the total; null where it is.
+    /// Why the epoch is left out of the total; null if it is not.
     left_out: Option<String>,
-    /// All null where it is left out.
+    /// All null if the epoch is left out.
     #[serde(flatten)]
     errors: TrajectorySummary,
 }
@@ -45,13 +45,13 @@ pub fn evaluation_json(evaluation: &EpochsEvaluation) -> serde_json::Result<Stri
     serde_json::to_string_pretty(&EvaluationSummary { total, epochs })
 }
 
-/// The scale where one epoch has all matches; `None` where several have one each.
+/// The scale if one epoch has all matches; `None` if several epochs each have their own.
 fn common_scale(evaluation: &EpochsEvaluation) -> Option<f64> {
     let mut scales = evaluation.evaluated().map(|of| of.alignment.scale);
     scales.next().filter(|_| scales.next().is_none())
 }
 
-/// The figures as a table; of several epochs a line for each before those of all.
+/// The figures as a table; with several epochs, a line for each precedes the total.
 pub fn evaluation_text(evaluation: &EpochsEvaluation, alignment: TrajectoryAlignment) -> String {
     let total = &evaluation.total;
     let (name, is_scaled) = match alignment {
@@ -92,7 +92,7 @@ fn statistics_row(name: &str, s: ErrorStatistics) -> String {
     format!("{name:<26} {:>12.6} {:>12.6} {:>12.6} {:>12.6}", s.rmse, s.mean, s.median, s.max)
 }
 
-/// A line for each of several epochs, and what the lines that follow are of; nothing of one.
+/// A line for each epoch and a heading for the total that follows; nothing for a single epoch.
 fn epoch_lines(evaluation: &EpochsEvaluation) -> Vec<String> {
     if evaluation.epochs.len() < 2 {
         return Vec::new();
@@ -101,7 +101,7 @@ fn epoch_lines(evaluation: &EpochsEvaluation) -> Vec<String> {
     let [poses, matched, path, scale, ate] = columns;
     let mut lines = vec![
         format!(
-            "{}, each with an origin and a unit of its own, aligned by itself",
+            "{}, each with a separate origin and unit, aligned by itself",
             counted(evaluation.epochs.len(), "epoch")
         ),
         format!("{:<12} {poses:>8} {matched:>8} {path:>12} {scale:>12} {ate:>12}", ""),

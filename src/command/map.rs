@@ -1,4 +1,4 @@
-//! `semidense map`: maps on disk.
+//! `semidense map`: commands for maps on disk.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -27,27 +27,27 @@ use crate::wire::topic::MAPPER_HEALTH;
 
 /// Check, export, save, load and merge maps on disk
 ///
-/// A map is a folder that `run`, `replay` and the services begin or continue with --map DIR.
+/// A map is a folder that `run`, `replay` and the services start or continue with --map DIR.
 #[derive(Debug, Args)]
 pub struct MapArguments {
     #[command(subcommand)]
     command: MapCommand,
 }
 
-/// The map on disk that a command begins or continues.
+/// The map on disk that a command starts or continues.
 #[derive(Debug, Clone, Args)]
 pub struct MapOptions {
-    /// Begin a map in this folder, or continue the one it holds: the camera is relocalised in it, and mapping continues
-    /// there [default: map.folder of the configuration, which is none]
+    /// Start a map in this folder, or continue the one it contains: the camera is relocalised in it and
+    /// mapping continues there [default: map.folder of the configuration, empty unless set]
     #[arg(long, value_name = "DIR")]
     map: Option<PathBuf>,
-    /// Only locate the camera in the map: nothing in its folder changes
+    /// Only localise the camera in the map: nothing in its folder changes
     #[arg(long)]
     read_only: bool,
 }
 
 impl MapOptions {
-    /// The configuration with what the command line says. The folder is checked before anything is started.
+    /// The configuration with the options of the command line. Checks the folder before anything is started.
     pub fn of(&self, config: &Config) -> Result<MapConfig, Box<dyn std::error::Error>> {
         let mut map = config.map.clone();
         if let Some(folder) = &self.map {
@@ -64,7 +64,7 @@ impl MapOptions {
         Ok(map)
     }
 
-    /// The same for a child process.
+    /// The same, as arguments for a child process.
     pub fn settings(map: &MapConfig) -> Vec<OsString> {
         let folder = toml::Value::String(map.folder.clone());
         let settings = [format!("map.folder={folder}"), format!("map.read_only={}", map.read_only)];
@@ -84,36 +84,36 @@ enum MapCommand {
 /// Have the running mapper save its map now
 #[derive(Debug, Args)]
 struct SaveArguments {
-    /// Folder that holds no map yet [default: the one that the mapper was started with]
+    /// Folder without a map [default: the folder that the mapper was started with]
     #[arg(value_name = "DIR")]
     folder: Option<PathBuf>,
 }
 
 /// Have the running mapper switch to the map in another folder
 ///
-/// It saves its own map first, where that has a folder, then relocalises the camera in the other one and continues there; a
-/// new epoch begins beside it where the camera is not found for two seconds. A map that does not fit is refused, and the
-/// mapper continues in its own.
+/// The mapper first saves its own map if that has a folder, then relocalises the camera in the other map and
+/// continues there; if the camera is not found for two seconds, a new epoch starts alongside it. A map that
+/// does not fit is refused, and the mapper continues with its own.
 #[derive(Debug, Args)]
 struct LoadArguments {
     /// Folder of the map
     #[arg(value_name = "MAP")]
     folder: PathBuf,
-    /// Only locate the camera in the map: nothing in its folder changes
+    /// Only localise the camera in the map: nothing in its folder changes
     #[arg(long)]
     read_only: bool,
 }
 
 /// Write two maps of one camera into one
 ///
-/// The epochs of both are kept, each with a place and a unit of its own, and the camera is found in either. They are not
-/// moved onto each other, even where they show the same place.
+/// The epochs of both are kept, each with its own origin and unit, and the camera can be found in either.
+/// They are not aligned with each other, even where they show the same place.
 #[derive(Debug, Args)]
 struct MergeArguments {
-    /// The first map: its numbers stay
+    /// The first map, which keeps its numbers
     #[arg(value_name = "A")]
     first: PathBuf,
-    /// The second map: its keyframes and epochs get new numbers
+    /// The second map, whose keyframes and epochs get new numbers
     #[arg(value_name = "B")]
     second: PathBuf,
     /// Folder of the new map
@@ -121,13 +121,13 @@ struct MergeArguments {
     output: PathBuf,
 }
 
-/// Check every file of a map and say what it holds; exit code 1 where something is damaged
+/// Check every file of a map and list what it contains; exit code 1 if anything is damaged
 #[derive(Debug, Args)]
 struct InfoArguments {
     /// The map's folder
     #[arg(value_name = "MAP")]
     folder: PathBuf,
-    /// Print it as JSON
+    /// Print the list as JSON
     #[arg(long)]
     json: bool,
 }
@@ -141,14 +141,14 @@ struct ExportArguments {
     /// Folder to write into
     #[arg(long, value_name = "DIR")]
     output: PathBuf,
-    /// The epoch to write: each has a place and a unit of its own [default: the one with the most keyframes]
+    /// The epoch to write: each has its own origin and unit [default: the one with the most keyframes]
     #[arg(long, value_name = "N")]
     epoch: Option<u32>,
     #[command(flatten)]
     points: MapPointOptions,
 }
 
-/// Runs it.
+/// Runs the chosen map command.
 pub fn run(config: &Config, arguments: MapArguments) -> CommandResult {
     match arguments.command {
         MapCommand::Info(arguments) => info(&arguments),
@@ -159,7 +159,7 @@ pub fn run(config: &Config, arguments: MapArguments) -> CommandResult {
     }
 }
 
-/// All of a map, and a warning for each file that is damaged.
+/// Loads the whole map and prints a warning for each damaged file.
 fn load_all(folder: &Path) -> Result<Loaded, Box<dyn std::error::Error>> {
     let loaded = load(folder, usize::MAX)?;
     loaded.problems.iter().for_each(|problem| note(&format!("warning: {problem}")));
@@ -260,7 +260,7 @@ fn load_running(config: &Config, arguments: &LoadArguments) -> CommandResult {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Asks the running mapper, and waits until it has done what it is asked for.
+/// Sends the command to the running mapper and waits until it is done.
 fn ask(config: &Config, name: &str, command: &Command) -> Result<(), Box<dyn std::error::Error>> {
     let place = Place::new(&config.instance, &config.root)?;
     let hub = Hub::join(&place, name, Access::Observer)?;
@@ -273,9 +273,9 @@ fn ask(config: &Config, name: &str, command: &Command) -> Result<(), Box<dyn std
     Ok(CommandClient::open(&hub)?.ask(command, timeout, is_alive)?)
 }
 
-/// The running mapper, once it answers commands.
+/// The running mapper, once it accepts commands.
 fn ready_mapper(hub: &Hub) -> Result<Peer, Box<dyn std::error::Error>> {
-    /// Longer than the time between two signs of life.
+    /// Longer than the period of the health reports.
     const LONGEST: Duration = Duration::from_secs(3);
     const PAUSE: Duration = Duration::from_millis(20);
     let mut mapper = Peer::open(hub, &MAPPER_HEALTH)?;

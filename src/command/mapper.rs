@@ -1,4 +1,4 @@
-//! `semidense mapper`: the semi-dense map.
+//! `semidense mapper`: estimates the semi-dense map.
 
 use std::process::ExitCode;
 
@@ -21,7 +21,7 @@ pub struct MapperArguments {
     map: MapOptions,
 }
 
-/// Runs it.
+/// Runs the mapper process.
 pub fn run(config: &Config, arguments: MapperArguments) -> CommandResult {
     let shutdown = Shutdown::install()?;
     let config = &Config { map: arguments.map.of(config)?, ..config.clone() };

@@ -1,10 +1,10 @@
-//! Reads the command line. What `clap` says of a wrong one is made to say where an option belongs, and which range a
-//! negative number misses.
+//! Parses the command line. Extends the errors of `clap`: they name the commands an option belongs to, and
+//! the range that a negative number misses.
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{Command, Error, Parser};
 
-/// The command line; help, version or what is wrong with it is printed and ends the process.
+/// Parses the command line; prints help, version or an error and ends the process.
 pub fn parse<T: Parser>() -> T {
     try_parse(std::env::args_os()).unwrap_or_else(|error| error.exit())
 }
@@ -18,7 +18,7 @@ fn try_parse<T: Parser, W: Into<std::ffi::OsString> + Clone>(
     T::from_arg_matches(&matches).map_err(|error| error.format(&mut command))
 }
 
-/// Takes `-3` for the value of the option before it, not for an option of its own.
+/// Takes `-3` as the value of the preceding option, not as an option.
 fn with_negative_numbers(command: Command) -> Command {
     let command = command.mut_args(|argument| {
         let is_valued = argument.get_action().takes_values() && !argument.is_positional();
@@ -27,7 +27,7 @@ fn with_negative_numbers(command: Command) -> Command {
     command.mut_subcommands(with_negative_numbers)
 }
 
-/// Of an option that is unknown here: the commands that have it, instead of how to pass it as a value.
+/// For an unknown option, names the commands that have it instead of explaining how to pass it as a value.
 fn with_owner(command: &Command, mut error: Error) -> Error {
     if error.kind() != ErrorKind::UnknownArgument || names_command(&error) {
         return error;
@@ -48,7 +48,7 @@ fn with_owner(command: &Command, mut error: Error) -> Error {
     error
 }
 
-/// Whether the error says already which command has the option: it stands before that.
+/// Whether the error already names the command that has the option, as it does if the option precedes that command.
 fn names_command(error: &Error) -> bool {
     let Some(ContextValue::StyledStrs(tips)) = error.get(ContextKind::Suggested) else {
         return false;
@@ -56,7 +56,7 @@ fn names_command(error: &Error) -> bool {
     tips.iter().any(|tip| tip.to_string().ends_with("exists"))
 }
 
-/// Collects the commands below `command`, with those they are in, that have `option`.
+/// Collects the commands below `command` that have `option`, with their parent commands.
 fn list_owners(command: &Command, path: &str, option: &str, owners: &mut Vec<String>) {
     for below in command.get_subcommands() {
         let name = format!("{path}{}", below.get_name());
@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn an_option_of_another_command_says_whose_it_is() {
+    fn an_option_of_another_command_names_its_owner() {
         let error = refused("semidense run DIR --debug-images");
         assert!(error.contains("tip: '--debug-images' belongs to 'replay'\n"), "{error}");
         assert!(!error.contains("as a value"), "{error}");

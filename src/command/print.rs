@@ -1,4 +1,4 @@
-//! What a command prints. Unlike `println!` it does not panic when the reader has gone away.
+//! Output of commands. Unlike `println!`, it does not panic when the reader has closed the pipe.
 
 use std::error::Error;
 use std::io::{self, Write};
@@ -6,29 +6,29 @@ use std::io::{self, Write};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use serde::Serialize;
 
-/// How long a line waits for a standard error that takes nothing: stopped by Ctrl-S, or a pipe that nobody reads.
+/// How long a line waits for a blocked standard error: stopped by Ctrl-S, or a pipe that is not read.
 const LONGEST_WAIT: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
 
-/// Standard output takes no more.
+/// Standard output cannot be written.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot write to standard output: {0}; redirect it to a place with room")]
+#[error("cannot write to standard output: {0}; redirect it to a disk with free space")]
 pub struct PrintError(#[from] io::Error);
 
 impl PrintError {
-    /// Whether the reader had enough, like `head`: no failure of the command.
+    /// Whether the reader closed the pipe early, as `head` does: not a failure of the command.
     pub fn is_reader_gone(&self) -> bool {
         self.0.kind() == io::ErrorKind::BrokenPipe
     }
 }
 
-/// Prints the text on standard output at once.
+/// Prints the text to standard output and flushes it.
 pub fn print(text: &str) -> Result<(), PrintError> {
     let mut stdout = io::stdout().lock();
     stdout.write_all(text.as_bytes())?;
     Ok(stdout.flush()?)
 }
 
-/// Prints `value` as JSON where that is asked for, else in words.
+/// Prints `value` as JSON if `json`, else as text.
 pub fn print_as<T: Serialize>(
     json: bool,
     value: &T,
@@ -41,12 +41,12 @@ pub fn print_as<T: Serialize>(
     Ok(print(&text)?)
 }
 
-/// Prints a line on standard error; nobody is left to be told when that fails. Nothing waits forever for
-/// somebody to read it.
+/// Prints a line to standard error and ignores failure, which could not be reported. Never waits indefinitely
+/// for a reader.
 pub fn note(line: &str) {
     let stderr = io::stderr();
     let mut ready = [PollFd::new(&stderr, PollFlags::OUT)];
-    // An error, or somebody who has gone, is met by the write.
+    // On an error or a closed pipe, the write itself fails.
     if !matches!(poll(&mut ready, Some(&LONGEST_WAIT)), Ok(0)) {
         let _ = (&stderr).write_all(format!("{line}\n").as_bytes());
     }

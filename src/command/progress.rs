@@ -1,5 +1,4 @@
-//! How long work shows that it continues: a bar on a terminal, plain lines otherwise; on stderr, so
-//! that stdout stays the result.
+//! Progress of long work: a bar on a terminal, plain lines otherwise; on stderr, so that stdout holds only the result.
 
 use std::cell::Cell;
 use std::io::IsTerminal;
@@ -9,26 +8,26 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::command::print::note;
 
-/// Time between two plain lines: a log of a long run stays short, and it is seen to continue.
+/// Time between two plain lines: the log of a long run stays short, yet shows that it continues.
 pub const LINE_PERIOD: Duration = Duration::from_secs(5);
 
-/// How a bar looks.
+/// Style of a progress bar.
 pub fn style(template: &str) -> ProgressStyle {
     ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
 }
 
-/// Progress of one piece of work.
+/// Progress of one task.
 #[derive(Debug)]
 pub struct Progress {
     what: &'static str,
     total: Option<usize>,
     bar: Option<ProgressBar>,
-    /// When the last plain line came, or the work began.
+    /// When the last plain line was printed, or the task started.
     last_line: Cell<Instant>,
 }
 
 impl Progress {
-    /// Progress of `what` (one word or two), `total` steps where that is known.
+    /// Progress of `what` (one or two words), with `total` steps if known.
     pub fn new(what: &'static str, total: Option<usize>) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
             let (bar, template) = match total {
@@ -43,7 +42,7 @@ impl Progress {
         Self { what, total, bar, last_line: Cell::new(Instant::now()) }
     }
 
-    /// `done` steps are over; `detail` says how it stands.
+    /// Reports that `done` steps are finished; `detail` describes the current state.
     pub fn update(&self, done: usize, detail: &str) {
         if let Some(bar) = &self.bar {
             bar.set_position(done as u64);
@@ -60,7 +59,7 @@ impl Progress {
         }
     }
 
-    /// Takes the bar away.
+    /// Removes the bar.
     pub fn finish(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();

@@ -1,4 +1,4 @@
-//! `semidense recover`: the results of a run that was killed, from its journal.
+//! `semidense recover`: writes the results of a killed run from its journal.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -29,13 +29,13 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;
 use crate::wire::place::Place;
 
-/// Write the results of a run that was killed, from the journal it left
+/// Write the results of a killed run from the journal it left
 #[derive(Debug, Args)]
 pub struct RecoverArguments {
     /// Output folder of the run [default: the newest killed run of this instance]
     #[arg(value_name = "DIR")]
     folder: Option<PathBuf>,
-    /// Write the results into another folder
+    /// Write the results to another folder
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]
@@ -48,7 +48,7 @@ pub struct RecoverArguments {
     json: bool,
 }
 
-/// Runs it.
+/// Writes the results.
 pub fn run(config: &Config, arguments: &RecoverArguments) -> CommandResult {
     let place = Place::new(&config.instance, &config.root)?;
     let found = find(&place, arguments.folder.as_deref())?;
@@ -68,7 +68,7 @@ pub fn run(config: &Config, arguments: &RecoverArguments) -> CommandResult {
             found.folder.display()
         )
     })?;
-    // Before the folder is locked: nothing is to be written into it.
+    // Before the folder is locked: nothing will be written to it.
     if recovered.recording.num_poses() == 0 {
         let outcome = nothing_to_recover(&recovered, held, arguments.keep);
         forget_removed_journals(&place);
@@ -90,12 +90,12 @@ pub fn run(config: &Config, arguments: &RecoverArguments) -> CommandResult {
     outcome
 }
 
-/// Looking for journals removes the pointers to those that are gone.
+/// Searching for journals removes the pointers to removed ones.
 fn forget_removed_journals(place: &Place) {
     drop(unfinished(Some(place), Path::new(PARENT)));
 }
 
-/// A run that was killed before its first pose: its journal goes, and its folder where nothing else is in it.
+/// A run that was killed before its first pose: removes its journal, and its folder if otherwise empty.
 fn nothing_to_recover(recovered: &Recovered, journal: Journal, keep: bool) -> CommandResult {
     let folder = journal.folder().to_owned();
     let journal_text = match keep {
@@ -113,9 +113,9 @@ fn nothing_to_recover(recovered: &Recovered, journal: Journal, keep: bool) -> Co
     Ok(ExitCode::from(NOTHING_TRACKED))
 }
 
-/// What to say where keyframes have no depth, and why.
+/// The warning for keyframes without depth, with the reason.
 fn depth_warning(map: &Map, config: &Config, journal: &Path) -> Option<String> {
-    /// A disk with less room than a few keyframes is full.
+    /// A disk with less room than a few keyframes counts as full.
     const FULL_BYTES: u64 = 8 << 20;
     let missing = without_depth(map);
     let all = map.keyframes.len();
@@ -138,7 +138,7 @@ fn depth_warning(map: &Map, config: &Config, journal: &Path) -> Option<String> {
     })
 }
 
-/// The journal that is meant: the newest one of the folder, or of all.
+/// The journal to recover: the newest one of the folder, or of all.
 fn find(place: &Place, folder: Option<&Path>) -> Result<Unfinished, Box<dyn Error>> {
     let mut found = match folder {
         Some(folder) => {
@@ -162,7 +162,7 @@ fn find(place: &Place, folder: Option<&Path>) -> Result<Unfinished, Box<dyn Erro
     Ok(newest)
 }
 
-/// The source of the run once more, for its true poses and depth; none where it cannot be opened.
+/// Reopens the source of the run for its true poses and depth; a source without truth if it cannot be opened.
 fn source_of(start: &RunStart, config: &Config) -> Box<dyn FrameSource> {
     let opened = || -> Result<Box<dyn FrameSource>, Box<dyn Error>> {
         let name = SourceName::parse(&start.source)?;
@@ -180,7 +180,7 @@ fn source_of(start: &RunStart, config: &Config) -> Box<dyn FrameSource> {
     })
 }
 
-/// What the journal has of the run.
+/// The record of the run from its journal.
 fn record_of(
     recovered: Recovered,
     config: &Config,
@@ -203,7 +203,7 @@ fn record_of(
     RunRecord { ended: EndOfRun::Recovered(recovered.ended), ..record }
 }
 
-/// A source that is not there any more, or never had any truth.
+/// A source that no longer exists, or never had ground truth.
 struct NoSource;
 
 impl FrameSource for NoSource {

@@ -1,4 +1,4 @@
-//! `semidense replay`: a sequence through tracker and mapper in one process, deterministic.
+//! `semidense replay`: runs a sequence through tracker and mapper in one process, deterministically.
 
 use std::error::Error;
 use std::io;
@@ -31,7 +31,7 @@ use crate::service::schedule::give_back_large_blocks;
 use crate::service::shutdown::Shutdown;
 use crate::wire::place::Place;
 
-/// What a replay can take; a camera gives no frame twice.
+/// Sources of a replay; a camera cannot repeat its frames.
 const SOURCE_HELP: &str = "Where frames come from: DIR (its layout is detected), sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR, \
      mcap:FILE[:TOPIC] (a recording of `semidense record` or a ROS 2 bag), or loop:FRAMES:HZ:SOURCE, which plays another source back and forth, FRAMES frames at HZ [default: capture.source \
      of the configuration, which is sim]. A camera cannot be replayed: use `semidense run`";
@@ -42,26 +42,25 @@ const RIG_HELP: &str = "Rig file with the camera's calibration, for recordings w
 #[derive(Debug, Args)]
 #[command(mut_arg("source", |source| source.help(SOURCE_HELP)), mut_arg("rig", |rig| rig.help(RIG_HELP)))]
 pub struct ReplayArgs {
-    /// Where frames come from and how the camera is.
+    /// Where frames come from, and the camera's calibration.
     #[command(flatten)]
     source: SourceArguments,
-    /// Folder for trajectory.txt, trajectory_online.txt, keyframes.txt, map.ply, points.ply, summary.json and report.html
-    /// [default: a new folder under ./output named by the time (UTC); output/latest links to the
-    /// newest]
+    /// Folder for trajectory.txt, trajectory_online.txt, keyframes.txt, map.ply, points.ply, summary.json and
+    /// report.html [default: a new folder under ./output named after the time (UTC); output/latest links to
+    /// the newest]
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]
     map: MapOptions,
     #[command(flatten)]
     points: MapPointOptions,
-    /// Where the first depth of a keyframe comes from
+    /// Source of a keyframe's initial depth
     #[arg(long, value_enum, default_value_t)]
     initial_depth: DepthOrigin,
-    /// Where poses come from
+    /// Source of the poses
     #[arg(long, value_enum, default_value_t)]
     poses: PoseOrigin,
-    /// Write images of every keyframe's inverse depth, variance, density and weights for three
-    /// motions into DIR/debug
+    /// Write images of every keyframe's inverse depth, variance, density and weights for three motions to DIR/debug
     #[arg(long)]
     debug_images: bool,
     /// Stop after N frames
@@ -70,7 +69,7 @@ pub struct ReplayArgs {
     /// Seed of the simulator [default: simulator.seed]
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Threads of the mapper, and of the results; they do not change either [default: mapper.threads]
+    /// Threads of the mapper and of the evaluation; results do not depend on them [default: mapper.threads]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
     /// Print the summary as JSON
@@ -78,10 +77,10 @@ pub struct ReplayArgs {
     json: bool,
 }
 
-/// An error that comes from another thread.
+/// An error from another thread.
 type SentError = dyn Error + Send + Sync;
 
-/// Replays, writes the results and prints the summary.
+/// Replays the sequence, writes the results and prints the summary.
 pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
     let (name, rig) = args.source.clone().source_and_rig(&config.capture)?;
     let (args, config) = (&args, &meant_config(config, &args, &name)?);
@@ -119,10 +118,10 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
         false => Ok(()),
     };
     let ending = Ending { output: &output, config, json: args.json, write_more: &write_more };
-    // On the threads of the replay: what it has freed is theirs.
+    // On the threads of the replay, to which the memory it freed belongs.
     let ended = pool.install(|| {
         ending.finish(&record, source.as_mut(), journal).map_err(|error| -> Box<SentError> {
-            // Whether only the reader has gone is decided by its type.
+            // Keeps the type that tells a reader that has gone from a failure.
             match error.downcast::<PrintError>() {
                 Ok(error) => error,
                 Err(error) => error.to_string().into(),
@@ -132,7 +131,7 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
     ended.map_err(|error| -> Box<dyn Error> { error })
 }
 
-/// The configuration as the arguments change it; an error where that cannot be replayed.
+/// The configuration with the arguments applied; an error if that cannot be replayed.
 fn meant_config(
     config: &Config,
     args: &ReplayArgs,
@@ -156,13 +155,13 @@ fn meant_config(
     Ok(meant)
 }
 
-/// What was replayed.
+/// A finished replay.
 struct Replayed {
     record: RunRecord,
     journal: Option<Journal>,
 }
 
-/// Prepares the source and replays it under a progress bar; `None` where a signal came before a frame.
+/// Prepares the source and replays it with a progress bar; `None` if a signal arrived before the first frame.
 fn record(
     config: &Config,
     args: &ReplayArgs,
@@ -187,7 +186,9 @@ fn record(
     let progress = Progress::new("replay", total);
     let mut journal = begin_journal()
         .inspect_err(|error| {
-            tracing::warn!("no journal is kept ({error}): a kill would lose the replay")
+            tracing::warn!(
+                "no journal is kept ({error}): if this process is killed, the replay is lost"
+            )
         })
         .ok();
     let replayed = replay(source, source_name, &config, &mut |frame| {
@@ -204,7 +205,7 @@ fn record(
             let fault = error.to_string();
             let (ReplayError::Cut { record, .. } | ReplayError::Unsaved { record, .. }) = error
             else {
-                // There is nothing that could be lost.
+                // Nothing could be lost.
                 drop(journal.map(Journal::finish));
                 return Err(error.into());
             };
@@ -214,7 +215,7 @@ fn record(
     Ok(Some(Replayed { record: RunRecord { ended, ..record }, journal }))
 }
 
-/// How the command line wants it replayed.
+/// The replay's settings from configuration and command line.
 fn replay_config(config: &Config, args: &ReplayArgs) -> ReplayConfig {
     ReplayConfig {
         tracker: config.tracking.clone(),

@@ -1,4 +1,4 @@
-//! The rig of a ROS 2 camera where none is named: what its CameraInfo says, fetched by `semidense-bridge`.
+//! Rig of a ROS 2 camera for which none is named: its CameraInfo, fetched by `semidense-bridge`.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -9,35 +9,35 @@ use crate::command::print::note;
 use crate::service::shutdown::Shutdown;
 use crate::wire::port::{WaitError, wait};
 
-/// Time between two looks for its end.
+/// Interval at which the bridge is checked for its end.
 const POLL_PERIOD: Duration = Duration::from_millis(50);
 
-/// Why there is no rig.
+/// Why no rig could be obtained.
 #[derive(Debug, thiserror::Error)]
 pub enum Ros2RigError {
-    /// There is no bridge.
+    /// The bridge is not installed.
     #[error(transparent)]
     NoBridge(#[from] BridgeError),
-    /// It cannot be started or waited for.
+    /// The bridge cannot be started or waited for.
     #[error("{}: {source}", program.display())]
     Program {
         /// The program.
         program: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// It failed, and has said why.
-    #[error("ros2:{0}: the camera's calibration is not known; name it with --rig FILE")]
+    /// The bridge failed and printed the reason.
+    #[error("ros2:{0}: the camera's calibration is unknown; name it with --rig FILE")]
     Failed(String),
     /// Waiting failed.
     #[error(transparent)]
     Wait(#[from] WaitError),
-    /// A signal came first.
+    /// A signal arrived first.
     #[error("interrupted")]
     Interrupted,
 }
 
-/// Waits for the CameraInfo beside `topic` and writes a rig file of it into `folder`.
+/// Waits for the CameraInfo that accompanies `topic` and writes it as a rig file to `folder`.
 pub fn fetch(topic: &str, folder: &Path, shutdown: &Shutdown) -> Result<PathBuf, Ros2RigError> {
     let program = bridge(&format!("run ros2:{topic}"))?;
     let path = folder.join("rig.toml");
@@ -62,6 +62,9 @@ pub fn fetch(topic: &str, folder: &Path, shutdown: &Shutdown) -> Result<PathBuf,
     if !status.success() {
         return Err(Ros2RigError::Failed(topic.to_owned()));
     }
-    note(&format!("no rig was named: the camera's is of its CameraInfo, {}", path.display()));
+    note(&format!(
+        "no rig was named: using one made from the camera's CameraInfo, {}",
+        path.display()
+    ));
     Ok(path)
 }

@@ -34,15 +34,15 @@ use crate::wire::place::Place;
 /// Run capture, tracker and mapper on a source, supervise them and write the results
 #[derive(Debug, Args)]
 pub struct RunArguments {
-    /// Where frames come from and how the camera is.
+    /// Where frames come from, and the camera's calibration.
     #[command(flatten)]
     source: SourceArguments,
     #[command(flatten)]
     mode: ModeArguments,
     #[command(flatten)]
     map: MapOptions,
-    /// Folder for trajectory, keyframes, map, summary and report [default: a new folder under ./output named by the
-    /// time (UTC); output/latest links to the newest]
+    /// Folder for trajectory, keyframes, map, summary and report [default: a new folder under ./output named
+    /// after the time (UTC); output/latest links to the newest]
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]
@@ -50,15 +50,15 @@ pub struct RunArguments {
     /// Print the summary as JSON and show no progress
     #[arg(long)]
     json: bool,
-    /// Serve the live page meanwhile [default address: 127.0.0.1:8765] (needs the package semidense-bridge)
+    /// Serve the live page during the run [default address: 127.0.0.1:8765] (needs the package semidense-bridge)
     #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true, default_missing_value = USUAL_PAGE)]
     view: Option<SocketAddr>,
 }
 
-/// Where the live page is served where nothing else is said.
+/// Address of the live page if none is given.
 const USUAL_PAGE: &str = "127.0.0.1:8765";
 
-/// Runs it.
+/// Runs the three processes and writes the results.
 pub fn run(
     config: &Config,
     common: &CommonArguments,
@@ -72,13 +72,13 @@ pub fn run(
     let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
     let mode = arguments.mode.mode(usual_mode(&source));
     let place = Place::new(&config.instance, &config.root)?;
-    // Where files are short whatever is opened next would take the blame.
+    // Otherwise a lack of file descriptors would be blamed on whatever is opened next.
     raise_open_files()?;
-    // First: a signal must find the folder's owner ready to remove it.
+    // First: on a signal, the owner of the folder must be ready to remove it.
     let shutdown = Shutdown::install()?;
     let output = OutputFolder::prepare(arguments.output.as_deref())?;
     let rig = match (&source, rig) {
-        // A ROS 2 topic brings its own calibration.
+        // A ROS 2 topic carries its own calibration.
         (SourceName::Ros2(topic), None) => match fetch_rig(topic, output.path(), &shutdown) {
             Err(Ros2RigError::Interrupted) => return Ok(ExitCode::from(INTERRUPTED)),
             rig => Some(rig?),
@@ -107,7 +107,7 @@ pub fn run(
     ending.finish(&outcome.record, outcome.source.as_mut(), outcome.journal.take())
 }
 
-/// What each process is told: what is common to all commands, and what this one was given for them.
+/// Arguments of each process: the common ones, and those of this command that concern them.
 fn child_arguments(
     common: &CommonArguments,
     arguments: &RunArguments,
@@ -123,7 +123,7 @@ fn child_arguments(
     told
 }
 
-/// Supervises the processes under a display, which names the live page once there is one.
+/// Supervises the processes under a progress display that names the live page once it is served.
 fn supervise_shown(
     config: &Config,
     options: &RunOptions,
@@ -143,7 +143,7 @@ fn supervise_shown(
     Ok(outcome?)
 }
 
-/// Ends a run that came to its end before the first pose: there is nothing that could be lost.
+/// Ends a run that stopped before its first pose: nothing could be lost.
 fn end_without_results(outcome: RunOutcome) -> CommandResult {
     drop(outcome.journal.map(Journal::finish));
     let EndOfRun::Failed(cause) = outcome.record.ended else {
@@ -153,14 +153,14 @@ fn end_without_results(outcome: RunOutcome) -> CommandResult {
     Err(cause.into())
 }
 
-/// Starts the live page beside the run.
+/// Starts the live page alongside the run.
 fn start_page(
     at: SocketAddr,
     common: &CommonArguments,
     place: &Place,
     log: &ErrorLog,
 ) -> Result<ViewChild, Box<dyn Error>> {
-    // The instance may be named by `--set` as well.
+    // The instance may also be set with `--set`.
     let common = CommonArguments { instance: Some(place.instance.clone()), ..common.clone() };
     let mut arguments = common.of_bridge();
     arguments.extend(["view".into(), "--listen".into(), at.to_string().into()]);

@@ -1,5 +1,5 @@
-//! How a run is shown: a bar on a terminal, plain lines otherwise. It is shown by a thread of its own, so that the
-//! supervisor does not wait for a terminal that is stopped or a pipe that nobody reads.
+//! Progress of a run: a bar on a terminal, plain lines otherwise. A separate thread prints it, so that the
+//! supervisor never waits for a stopped terminal or a pipe that is not read.
 
 use std::io::{self, IsTerminal};
 use std::time::Instant;
@@ -13,7 +13,7 @@ use crate::service::run_progress::RunProgress;
 use crate::slam::counted::counted;
 use crate::slam::pose::TrackingState;
 
-/// Starts the thread that shows the progress of a run: nothing if quiet, else what suits the terminal.
+/// Starts the thread that shows the progress of a run: nothing if `is_quiet`, else what suits the terminal.
 pub fn start_display(is_quiet: bool) -> io::Result<ProgressThread> {
     let mut shown = Shown::new(is_quiet);
     ProgressThread::start(move |progress| match progress {
@@ -22,20 +22,20 @@ pub fn start_display(is_quiet: bool) -> io::Result<ProgressThread> {
     })
 }
 
-/// What the user sees.
+/// What the user is shown.
 #[derive(Debug)]
 struct Shown {
     bar: Option<ProgressBar>,
     is_quiet: bool,
-    /// When the last plain line came, or the run began.
+    /// When the last plain line was printed, or the run started.
     last_line: Instant,
-    /// What is waited for, once it has been told.
+    /// What the run waits for, once it has been printed.
     waits_for: Option<String>,
 }
 
-/// Of a source with so many frames.
+/// Template for a source with a known number of frames.
 const WITH_END: &str = "{prefix:9} {bar:40} {pos}/{len} {msg}";
-/// Of a camera.
+/// Template for a camera.
 const WITHOUT_END: &str = "{prefix:9} {pos} frames, {msg}";
 
 impl Shown {
@@ -70,14 +70,14 @@ impl Shown {
         }
         let has_work = total > 0 || matches!(progress, RunProgress::Running { .. });
         if !self.is_quiet && has_work && self.last_line.elapsed() >= LINE_PERIOD {
-            // How many frames a camera will give nobody knows.
+            // The number of frames that a camera will deliver is unknown.
             let of = if total > 0 { format!("/{total}") } else { String::new() };
             note(format!("{prefix} {done}{of} {message}").trim_end());
             self.last_line = Instant::now();
         }
     }
 
-    /// Says once that a camera is waited for, and why.
+    /// Prints once that the run waits for a camera, and why.
     fn show_waiting(&mut self, reason: &str) {
         if self.waits_for.as_deref() == Some(reason) {
             return;
@@ -91,7 +91,7 @@ impl Shown {
         }
     }
 
-    /// Takes the bar away.
+    /// Removes the bar.
     fn finish(&self) {
         self.bar.iter().for_each(ProgressBar::finish_and_clear);
     }

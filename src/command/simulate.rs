@@ -1,4 +1,4 @@
-//! `semidense simulate`: a simulated sequence as a dataset with exact depth and poses.
+//! `semidense simulate`: writes a simulated sequence as a dataset with exact depth and poses.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -22,7 +22,7 @@ use crate::service::shutdown::Shutdown;
 
 /// Frames written between two updates of the progress bar.
 const FRAMES_PER_BATCH: usize = 24;
-/// Gradient from which a pixel counts as textured, grey levels a pixel.
+/// Gradient from which a pixel counts as textured, grey levels per pixel.
 const TEXTURED_GRADIENT: f64 = 5.0;
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -41,9 +41,9 @@ enum Scene {
     Plane,
     /// A corridor of 24 x 2.4 x 2.6 m
     Corridor,
-    /// Four furnished rooms about a corridor, walked through twice
+    /// Four furnished rooms along a corridor, walked through twice
     Flat,
-    /// Two rooms exactly alike on a corridor that repeats
+    /// Two identical rooms on a repeating corridor
     Twins,
 }
 
@@ -89,7 +89,7 @@ pub struct SimulateArgs {
     /// Frames per second
     #[arg(long, value_name = "HZ")]
     rate: Option<f64>,
-    /// Image width in pixels; the focal length follows, so that the view stays as wide
+    /// Image width in pixels; the focal length follows, so that the field of view is unchanged
     #[arg(long, value_name = "PX")]
     width: Option<usize>,
     /// Image height in pixels
@@ -98,7 +98,7 @@ pub struct SimulateArgs {
     /// Focal length in pixels
     #[arg(long, value_name = "PX")]
     focal: Option<f64>,
-    /// Factor for all lengths of world and path
+    /// Scale factor for all lengths of world and path
     #[arg(long, value_name = "FACTOR")]
     world_scale: Option<f64>,
     #[command(flatten, next_help_heading = "Motion")]
@@ -118,7 +118,7 @@ struct MotionArgs {
     /// Mean turn rate in degrees per second
     #[arg(long, value_name = "DEG/S")]
     turn: Option<f64>,
-    /// Factor for hand tremor
+    /// Scale factor for hand tremor
     #[arg(long, value_name = "FACTOR")]
     tremor: Option<f64>,
 }
@@ -131,7 +131,7 @@ struct SensorArgs {
     /// Share of light lost in the image corners, 0 to 0.95
     #[arg(long, value_name = "SHARE")]
     vignette: Option<f64>,
-    /// Amplitude of the slow change of gain, as natural logarithm
+    /// Amplitude of the slow change of gain, as a natural logarithm
     #[arg(long, value_name = "LOG")]
     gain_change: Option<f64>,
     /// Amplitude of the slow change of offset in grey levels
@@ -140,10 +140,10 @@ struct SensorArgs {
     /// Period of both changes in seconds
     #[arg(long, value_name = "S")]
     exposure_period: Option<f64>,
-    /// Exposure time in ms: motion blurs over it
+    /// Exposure time in ms, which sets the motion blur
     #[arg(long, value_name = "MS")]
     exposure: Option<f64>,
-    /// Time between the starts of two rows in microseconds: rolling shutter
+    /// Time between the starts of two rows in microseconds (rolling shutter)
     #[arg(long, value_name = "US")]
     row_time: Option<f64>,
     /// Lens distortion: 4, 5 or 8 of k1,k2,p1,p2,k3,k4,k5,k6 (radtan, as OpenCV)
@@ -151,7 +151,7 @@ struct SensorArgs {
     distortion: Option<Vec<f64>>,
 }
 
-/// What was written.
+/// Summary of the written dataset.
 #[derive(Debug, Serialize)]
 struct Summary {
     /// As text, whatever its bytes.
@@ -160,13 +160,13 @@ struct Summary {
     seed: u64,
     #[serde(flatten)]
     path: PathSummary,
-    /// Mean share of pixels with a gradient of at least 5 grey levels a pixel.
+    /// Mean share of pixels with a gradient of at least 5 grey levels per pixel.
     gradient_share: f64,
 }
 
-/// Renders, writes the dataset and prints its summary.
+/// Renders and writes the dataset and prints its summary.
 pub fn run(config: &Config, args: &SimulateArgs) -> Result<ExitCode, Box<dyn Error>> {
-    // First: a signal must find the writer ready to remove what it has begun.
+    // First: on a signal, the writer must be ready to remove what it has started.
     let shutdown = Shutdown::install()?;
     let mut simulator = Simulator::new(params(&config.simulator, args))?;
     let layout = match args.layout {
@@ -192,7 +192,7 @@ pub fn run(config: &Config, args: &SimulateArgs) -> Result<ExitCode, Box<dyn Err
     Ok(ExitCode::SUCCESS)
 }
 
-/// Renders and writes all frames; the mean share of textured pixels, `None` after a signal.
+/// Renders and writes all frames; returns the mean share of textured pixels, `None` after a signal.
 fn write_frames(
     simulator: &mut Simulator,
     writer: &DatasetWriter,
@@ -201,7 +201,7 @@ fn write_frames(
     let frames = simulator.params().frames;
     let progress = Progress::new("simulate", Some(frames));
     let mut shares = 0.0;
-    // Rendered and written batch by batch: memory stays small however long the sequence is.
+    // In batches, so that memory stays small however long the sequence.
     for first in (0..frames).step_by(FRAMES_PER_BATCH) {
         let batch = first..(first + FRAMES_PER_BATCH).min(frames);
         let written: Result<Vec<f64>, DatasetError> = batch
@@ -223,7 +223,7 @@ fn write_frames(
     Ok(Some(shares / frames as f64))
 }
 
-/// Renders and writes one frame; its share of textured pixels.
+/// Renders and writes one frame; returns its share of textured pixels.
 fn write_frame(
     simulator: &Simulator,
     writer: &DatasetWriter,
@@ -253,7 +253,7 @@ fn summary_text(summary: &Summary) -> String {
     )
 }
 
-/// The configuration with what the command line says otherwise.
+/// The configuration with the options of the command line.
 fn params(configured: &SimulatorParams, args: &SimulateArgs) -> SimulatorParams {
     fn set<T: Clone>(value: &mut T, said: &Option<T>) {
         if let Some(said) = said {
@@ -273,7 +273,7 @@ fn params(configured: &SimulatorParams, args: &SimulateArgs) -> SimulatorParams 
     set(&mut params.rate_hz, &args.rate);
     set(&mut params.width, &args.width);
     set(&mut params.height, &args.height);
-    // A smaller image of the same view: one as narrow as the width alone would make it tells turns from paths badly.
+    // A smaller image of the same view: a narrower field of view would make turns and translations hard to tell apart.
     let widened = args.width.map(|px| px as f64 / configured.width as f64);
     set(&mut params.focal_px, &args.focal.or(widened.map(|by| by * configured.focal_px)));
     set(&mut params.world_scale, &args.world_scale);
@@ -297,7 +297,7 @@ fn params(configured: &SimulatorParams, args: &SimulateArgs) -> SimulatorParams 
     set(&mut params.sensor.exposure_ms, &sensor.exposure);
     set(&mut params.sensor.row_time_us, &sensor.row_time);
     set(&mut params.sensor.distortion, &sensor.distortion);
-    // Last: the length of a route is that at the speed and rate.
+    // Last: the length of a route follows from speed and rate.
     match scene {
         Some(scene) => params.with_scene(scene),
         None => params,
@@ -317,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn a_smaller_image_shows_the_same_view_unless_told_otherwise() {
+    fn a_smaller_image_keeps_the_field_of_view_unless_a_focal_length_is_given() {
         let configured = SimulatorParams::default();
         let focal = |line: &str| {
             let words = "simulate --output out ".to_owned() + line;

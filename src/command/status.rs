@@ -1,4 +1,4 @@
-//! `semidense status`: what is running, and how well.
+//! `semidense status`: shows what is running, and how well.
 
 use std::error::Error;
 use std::io::IsTerminal;
@@ -28,22 +28,22 @@ use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub, OpenError, Subscriber, wait};
 use crate::wire::topic::{HEALTH_TOPICS, MAPPER_HEALTH, POSE, Topic};
 
-/// Time between two looks.
+/// Update period.
 const PERIOD: Duration = Duration::from_secs(1);
-/// The same where one look is all: processes answer whoever joins within their next frame.
+/// The same with `--once`: processes answer a new subscriber within their next frame.
 const ONCE_PERIOD: Duration = Duration::from_millis(50);
-/// Looks after which `--once` shows what it has: a process that hangs or ends answers no more. Three seconds.
+/// Updates after which `--once` prints what it has: a process that hangs or ends does not answer. Three seconds.
 const MAX_LOOKS: usize = 60;
-/// A process that has said nothing for so long is not there any more.
+/// A process that has not reported for longer is stale.
 const STALE_NANOS: i64 = 3_000_000_000;
 
-/// What the process of `semidense run` claims to be.
+/// Name that the process of `semidense run` claims.
 const SUPERVISOR: &str = "supervisor";
 
-/// Width of a terminal that does not tell its own, columns.
+/// Width of a terminal that does not report its own, columns.
 const USUAL_WIDTH: usize = 80;
 
-/// Terminals clear the screen and go to its first place.
+/// Clears the terminal and moves the cursor to its top left.
 const CLEAR_SCREEN: &str = "\x1b[2J\x1b[H";
 
 /// Show states, rates and latencies of the running processes
@@ -53,15 +53,15 @@ pub struct StatusArguments {
     /// Show the status once and exit
     #[arg(long)]
     once: bool,
-    /// Refresh once a second until Ctrl-C, also where nothing runs yet and where a run has ended
+    /// Refresh once a second until Ctrl-C, even if nothing runs yet or a run has ended
     #[arg(long, conflicts_with = "once")]
     watch: bool,
-    /// Print one JSON object per update, each on a line; the position of the pose is null while none is claimed
+    /// Print one JSON object per update, each on its own line; the pose's position is null while no pose is claimed
     #[arg(long)]
     json: bool,
 }
 
-/// Runs it.
+/// Prints the status.
 pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
     let place = Place::new(&config.instance, &config.root)?;
     note_unfinished(&unfinished(Some(&place), Path::new(".")));
@@ -82,18 +82,18 @@ pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
     }
 }
 
-/// Whether nothing runs there, as far as can be seen from here.
+/// Whether nothing runs, as far as can be seen from this process.
 fn is_absence(error: &(dyn Error + 'static)) -> bool {
     error.downcast_ref().is_some_and(OpenError::is_absence)
 }
 
-/// What goes in front of an update: on a terminal it takes the place of the one before.
+/// Prefix of an update: on a terminal it replaces the previous one.
 fn clear(arguments: &StatusArguments) -> &'static str {
     let is_live = std::io::stdout().is_terminal() && !arguments.once && !arguments.json;
     if is_live { CLEAR_SCREEN } else { "" }
 }
 
-/// Shows the run that is on until it ends, or once.
+/// Shows the running instance until it ends, or once.
 fn follow(
     place: &Place,
     arguments: &StatusArguments,
@@ -127,7 +127,7 @@ fn follow(
     Ok(())
 }
 
-/// A look where there is nothing to see.
+/// The status when nothing runs.
 fn nothing_runs(instance: &str) -> Value {
     json!({
         "instance": instance, "source": null, "uptime_secs": null, "keyframes": null, "capture": null, "tracker": null,
@@ -135,13 +135,13 @@ fn nothing_runs(instance: &str) -> Value {
     })
 }
 
-/// Columns of the terminal; the usual ones where standard output is none.
+/// Columns of the terminal; [`USUAL_WIDTH`] if standard output is not one.
 fn terminal_width() -> usize {
     let size = rustix::termios::tcgetwinsize(std::io::stdout());
     size.map_or(USUAL_WIDTH, |size| usize::from(size.ws_col)).max(1)
 }
 
-/// What is listened to.
+/// The subscriptions of a status display.
 struct Watch<'a> {
     place: &'a Place,
     peers: Vec<Option<Peer>>,
@@ -154,13 +154,13 @@ impl<'a> Watch<'a> {
         let listen = |topic| unless_absent(Peer::open(hub, topic));
         let peers = HEALTH_TOPICS.iter().map(listen).collect::<Result<Vec<_>, _>>()?;
         if peers.iter().all(Option::is_none) {
-            // Its error says that nothing runs, unless this has changed just now.
+            // Its error reports that nothing runs, unless that has just changed.
             Peer::open(hub, &HEALTH_TOPICS[0])?;
         }
         Ok(Self { place, peers, poses: None, last_pose: None })
     }
 
-    /// Whether every process that is there has said how it is, and the tracker its pose.
+    /// Whether every running process has reported its health, and the tracker its pose.
     fn is_complete(&self, look: &Value) -> bool {
         let is_heard = |topic: &Topic| {
             let id = self.place.claimant(topic.owner);
@@ -171,14 +171,14 @@ impl<'a> Watch<'a> {
         HEALTH_TOPICS.iter().all(is_heard) && (!counts_frames || !look["pose"].is_null())
     }
 
-    /// One look.
+    /// One update.
     fn look(&mut self, hub: &Hub) -> Result<Value, Box<dyn Error>> {
         let mut look = json!({ "instance": self.place.instance, "source": null, "uptime_secs": null, "keyframes": null });
         let now = now_nanos();
         let (mut heard, mut ended) = (0, 0);
         for (topic, peer) in HEALTH_TOPICS.iter().zip(&mut self.peers) {
             if peer.is_none() {
-                // It may have come up since the last look.
+                // It may have started since the last update.
                 *peer = unless_absent(Peer::open(hub, topic))?;
             }
             if let Some(peer) = peer {
@@ -186,7 +186,7 @@ impl<'a> Watch<'a> {
             }
             let said = peer.as_ref().and_then(|peer| Some((peer.state(), peer.last()?)));
             let Some((reported, health)) = said else {
-                // One that is stopped cannot hand its last report to a subscriber that joins.
+                // A stopped process cannot deliver its last report to a new subscriber.
                 let id = self.place.claimant(topic.owner);
                 let stopped = id.filter(|&id| Liveness::of(id) == Liveness::Stopped);
                 look[topic.owner] = stopped
@@ -205,7 +205,7 @@ impl<'a> Watch<'a> {
             }
             let known = look["uptime_secs"].as_f64().unwrap_or_default();
             let own = look[topic.owner]["uptime_secs"].as_f64().unwrap_or_default();
-            // Without a supervisor the oldest tells best: one that was restarted is younger than the run.
+            // Without a supervisor the oldest process is the best estimate: a restarted one is younger than the run.
             look["uptime_secs"] = json!(known.max(own));
         }
         if let Some(age) = self.place.claimant(SUPERVISOR).and_then(age) {
@@ -220,7 +220,7 @@ impl<'a> Watch<'a> {
         Ok(look)
     }
 
-    /// Keyframes by the newest checkpoint of a mapper that says nothing: one that is stopped, or has died.
+    /// Keyframes in the newest checkpoint of a mapper that does not report: a stopped or a dead one.
     fn keyframes_of_checkpoint(&self) -> Option<usize> {
         let map = read_checkpoint(&self.place.checkpoint_path()).ok()??;
         Some(map.keyframes.len())
@@ -242,8 +242,8 @@ impl<'a> Watch<'a> {
 /// The state of a process that has ended.
 const NOT_RUNNING: &str = "not running";
 
-/// What a process is doing: by its own report, unless the kernel knows better. A process in another
-/// container has an id that means nothing here; as long as it reports it is believed.
+/// State of a process: its own report, unless the kernel contradicts it. The id of a process in another
+/// container is meaningless here; its reports are believed as long as they arrive.
 fn state_of(health: &HealthMessage, reported: Option<&'static str>, now: i64) -> &'static str {
     let is_stale = now - health.published_nanos > STALE_NANOS;
     let has_finished = matches!(reported, Some("finished" | "failed"));
@@ -255,7 +255,7 @@ fn state_of(health: &HealthMessage, reported: Option<&'static str>, now: i64) ->
     }
 }
 
-/// A pose as JSON. It has a position only while it is claimed: what a lost tracker sends is where it was last.
+/// A pose as JSON. It has a position only while it is claimed: a lost tracker sends its last known position.
 fn pose_row(pose: &PoseMessage, now: i64) -> Value {
     let state = state_from_codes(pose.state, pose.reason).ok();
     let [.., x, y, z] = pose.world_from_camera;
@@ -268,7 +268,7 @@ fn pose_row(pose: &PoseMessage, now: i64) -> Value {
     })
 }
 
-/// What was opened; `None` where its process does not run.
+/// The opened port; `None` if its process does not run.
 fn unless_absent<T>(opened: Result<T, OpenError>) -> Result<Option<T>, OpenError> {
     match opened {
         Ok(opened) => Ok(Some(opened)),

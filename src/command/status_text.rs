@@ -1,4 +1,4 @@
-//! How `semidense status` looks: a table that fits the terminal, and a legend.
+//! Output of `semidense status`: a table that fits the terminal, and a legend.
 
 use serde_json::Value;
 
@@ -7,11 +7,11 @@ use crate::slam::counted::counted;
 /// A column of the table.
 struct Column {
     heading: &'static str,
-    /// Widest text that is expected.
+    /// Widest text expected.
     width: usize,
-    /// Columns of a higher number go first where the terminal is narrow.
+    /// On a narrow terminal, columns with a higher rank are dropped first.
     rank: u8,
-    /// Where the value is in a process's object (a JSON pointer), and its decimals.
+    /// JSON pointer to the value in a process's object, and its decimals.
     value: (&'static str, usize),
     legend: &'static str,
 }
@@ -26,7 +26,7 @@ const fn column(
     Column { heading, width, rank, value, legend }
 }
 
-/// Everything that can be shown of a process, in the order of the columns.
+/// Everything that can be shown about a process, in the order of the columns.
 const COLUMNS: [Column; 8] = [
     column("frames", 8, 2, ("/frames", 0), "handled since the process started"),
     column("rate", 6, 1, ("/rate_hz", 1), "frames per second"),
@@ -40,11 +40,11 @@ const COLUMNS: [Column; 8] = [
 const P50_LEGEND: &str =
     "median ms: capture from stamp to sending, tracker from stamp to pose, mapper per frame";
 
-/// Name and state, in front of the columns: `capture  not running`.
+/// Name and state, before the columns: `capture  not running`.
 const NAME_WIDTH: usize = 8;
 const STATE_WIDTH: usize = 12;
 
-/// The lines of one look, wrapped at words to `width` columns.
+/// The lines of one update, wrapped at words to `width` columns.
 pub fn status_text(look: &Value, width: usize) -> String {
     let mut lines = wrapped(&headline(look), width, 0);
     if let Some(pose) = pose_line(&look["pose"]) {
@@ -65,7 +65,7 @@ pub fn status_text(look: &Value, width: usize) -> String {
     lines.join("\n") + "\n"
 }
 
-/// One line for each column: for `--help`.
+/// One line for each column, for `--help`.
 pub fn legend() -> String {
     let mut text = "Columns (fewer on a narrow terminal):\n  state   as the process reports it; or `stopped` by a signal, `silent` for 3 s, `not running`\n".to_owned();
     for column in &COLUMNS {
@@ -75,7 +75,7 @@ pub fn legend() -> String {
     text + "Exits when all processes of the run have ended."
 }
 
-/// The columns that fit, the most important first to be kept.
+/// The columns that fit, chosen by importance.
 fn fitting(width: usize) -> Vec<&'static Column> {
     let mut columns: Vec<&Column> = COLUMNS.iter().collect();
     let needed = |columns: &[&Column]| {
@@ -101,7 +101,7 @@ fn headline(look: &Value) -> String {
     parts.join(", ")
 }
 
-/// Minutes and seconds, with hours where there are any.
+/// Minutes and seconds, with hours if there are any.
 fn clock(secs: f64) -> String {
     let secs = secs.max(0.0) as u64;
     let (hours, minutes, secs) = (secs / 3600, secs / 60 % 60, secs % 60);
@@ -112,7 +112,7 @@ fn clock(secs: f64) -> String {
     }
 }
 
-/// Last pose: state, position where there is one, age.
+/// Last pose: state, position if it has one, age.
 fn pose_line(pose: &Value) -> Option<String> {
     let state = pose["state"].as_str()?;
     let age = pose["age_secs"].as_f64()?;
@@ -128,7 +128,7 @@ fn pose_line(pose: &Value) -> Option<String> {
     Some(format!("last pose {state}{position}, {age}"))
 }
 
-/// A process: its row, why it is in its state, what it was refused.
+/// A process: its row, the reason for its state, and its warning.
 fn process_lines(name: &str, row: &Value, columns: &[&Column], width: usize) -> Vec<String> {
     let state = row["state"].as_str().unwrap_or("not running");
     let mut line = format!("{name:NAME_WIDTH$} {state:STATE_WIDTH$}");
@@ -150,7 +150,7 @@ fn process_lines(name: &str, row: &Value, columns: &[&Column], width: usize) -> 
     lines
 }
 
-/// What the mapper's joint estimation of keyframes did; nothing before its first estimate.
+/// Figures of the mapper's joint estimation of keyframes; `None` before the first estimate.
 fn joint_line(adjustments: &Value) -> Option<String> {
     let (p50, p99) = (&adjustments["cpu_ms"]["p50"], &adjustments["cpu_ms"]["p99"]);
     Some(format!(
@@ -163,7 +163,7 @@ fn joint_line(adjustments: &Value) -> Option<String> {
     ))
 }
 
-/// What the mapper's search for loops came to; nothing before the first.
+/// Outcome of the mapper's search for loops; `None` before the first.
 fn loop_line(loops: &Value) -> Option<String> {
     let of = |key: &str| loops[key].as_u64();
     of("searched").filter(|searched| *searched > 0)?;
@@ -181,8 +181,8 @@ fn loop_line(loops: &Value) -> Option<String> {
     ))
 }
 
-/// Lines of at most `width` characters, broken at spaces; all but the first indented. Only a word that is
-/// longer than a line is cut.
+/// Lines of at most `width` characters, broken at spaces; all but the first indented. Only a word longer than
+/// a line is cut.
 fn wrapped(text: &str, width: usize, indent: usize) -> Vec<String> {
     let width = width.max(indent + 8);
     let lead: String = text.chars().take_while(|c| *c == ' ').collect();
@@ -283,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn where_no_loop_was_looked_for_nothing_is_said_of_loops() {
+    fn loops_are_not_mentioned_before_a_search_for_them() {
         let mut look = look();
         look["tracker"]["loops"]["searched"] = json!(0);
         look["capture"]["loops"] = Value::Null;
@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn a_word_longer_than_a_line_is_cut_and_nothing_is_lost() {
+    fn a_word_longer_than_a_line_is_cut_without_loss() {
         let lines = wrapped("a bcdefghijklmnopqrstuvwxyz z", 12, 2);
         assert!(lines.iter().all(|line| line.chars().count() <= 12), "{lines:?}");
         assert_eq!(lines.concat().replace(' ', ""), "abcdefghijklmnopqrstuvwxyzz");

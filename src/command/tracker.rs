@@ -1,4 +1,4 @@
-//! `semidense tracker`: one pose for each frame.
+//! `semidense tracker`: computes one pose for each frame.
 
 use std::process::ExitCode;
 
@@ -18,7 +18,7 @@ pub struct TrackerArguments {
     mode: ModeArguments,
 }
 
-/// Runs it.
+/// Runs the tracker process.
 pub fn run(config: &Config, arguments: TrackerArguments) -> CommandResult {
     let shutdown = Shutdown::install()?;
     run_shell(config, arguments.mode.mode(Mode::Live), &shutdown)?;

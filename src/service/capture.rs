@@ -266,8 +266,8 @@ impl<'a> Shell<'a> {
         match arrival {
             Arrival::Frame => {
                 match self.absence.take().map(|_| self.next_sequence) {
-                    Some(None) => tracing::info!("capture: frames are coming"),
-                    Some(Some(_)) => tracing::warn!("capture: frames are coming again"),
+                    Some(None) => tracing::info!("capture: frames are arriving"),
+                    Some(Some(_)) => tracing::warn!("capture: frames are arriving again"),
                     None => {}
                 }
                 self.health.enter(ProcessState::Running, &self.refused.text().unwrap_or_default());

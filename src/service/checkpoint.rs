@@ -48,7 +48,7 @@ impl Kept {
                 (Some(Self { checkpoint, reservation, handed_nanos: 0 }), left)
             }
             Err(error) => {
-                tracing::warn!("there will be no checkpoints ({error})");
+                tracing::warn!("no checkpoints will be written ({error})");
                 (None, left)
             }
         }
@@ -176,7 +176,7 @@ impl Drop for Checkpoint {
 fn write_or_warn(path: &Path, map: &Map) {
     if let Err(error) = write_privately(path, |file| write_map_into(file, map)) {
         tracing::warn!(
-            "{}: cannot write the checkpoint ({error}); a restarted mapper would begin a new map",
+            "{}: cannot write the checkpoint ({error}); a restarted mapper would start a new map",
             path.display()
         );
     }

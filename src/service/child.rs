@@ -40,10 +40,10 @@ const LAST_WORDS: Duration = Duration::from_secs(1);
 #[derive(Debug, thiserror::Error)]
 pub enum FollowError {
     /// The supervisor has died before this process could follow it.
-    #[error("the supervisor is gone")]
+    #[error("the supervisor has exited")]
     Gone,
     /// The kernel refuses the request.
-    #[error("cannot watch whether the supervisor lives ({0})")]
+    #[error("cannot watch whether the supervisor is alive ({0})")]
     Kernel(io::Error),
 }
 

@@ -416,7 +416,7 @@ fn apply(table: &mut Table, setting: &str) -> Result<(), String> {
         .unwrap_or_else(|| Value::String(value.to_owned()));
     let key = layout::plain(path.trim());
     if let Some(now) = layout::moved(key) {
-        return Err(format!("`{key}` is `{now}` now"));
+        return Err(format!("`{key}` is now `{now}`"));
     }
     let mut keys: Vec<&str> = key.split('.').map(str::trim).collect();
     let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(|| form.to_owned())?;

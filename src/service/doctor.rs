@@ -114,7 +114,7 @@ fn real_time_limit(config: &Config) -> Finding {
         "LimitRTPRIO={wanted} in the unit, or `{} - rtprio {wanted}` in /etc/security/limits.conf, then log in again",
         user()
     );
-    let found = format!("priorities up to {found}, {wanted} wanted");
+    let found = format!("priorities up to {found}, {wanted} needed");
     match wants_real_time(config) {
         true => Finding::error(SUBJECT, found, remedy),
         false => Finding::warning(SUBJECT, found, remedy),
@@ -133,7 +133,7 @@ fn memory_limit(config: &Config) -> Finding {
         "LimitMEMLOCK=infinity in the unit, or `{} - memlock unlimited` in /etc/security/limits.conf, then log in again",
         user()
     );
-    let found = format!("{} MB may be locked, which is too little", limit.unwrap_or(0) >> 20);
+    let found = format!("only {} MB may be locked, which is too little", limit.unwrap_or(0) >> 20);
     match config.tracker.scheduling.lock_memory {
         true => Finding::error(SUBJECT, found, remedy),
         false => Finding::warning(SUBJECT, found, remedy),
@@ -218,7 +218,7 @@ impl Machine {
                 Finding::ok(SUBJECT, format!("{runtime} of {period} µs: enough"))
             }
             (Some(_), _) => Finding::ok(SUBJECT, "off"),
-            _ => Finding::ok(SUBJECT, "unknown: the kernel does not tell"),
+            _ => Finding::ok(SUBJECT, "unknown: the kernel does not report it"),
         }
     }
 
@@ -240,7 +240,7 @@ impl Machine {
         const SUBJECT: &str = "clock source";
         let folder = "sys/devices/system/clocksource/clocksource0";
         let Some(current) = self.read(&format!("{folder}/current_clocksource")) else {
-            return Finding::ok(SUBJECT, "unknown: the kernel does not tell");
+            return Finding::ok(SUBJECT, "unknown: the kernel does not report it");
         };
         let slow = ["hpet", "acpi_pm", "jiffies", "refined-jiffies"];
         if !slow.contains(&current.as_str()) {
@@ -260,13 +260,13 @@ impl Machine {
         let count = std::thread::available_parallelism().map_or(1, usize::from);
         let kernel = match self.read("sys/kernel/realtime").as_deref() {
             Some("1") => "a real-time kernel",
-            _ => "no real-time kernel",
+            _ => "not a real-time kernel",
         };
         let found = format!("{count}, {kernel}");
         if count >= 2 {
             return Finding::ok(SUBJECT, found);
         }
-        Finding::warning(SUBJECT, found, "give it two or more: the mapper takes one for itself")
+        Finding::warning(SUBJECT, found, "provide two or more: the mapper occupies one")
     }
 }
 

@@ -19,16 +19,16 @@ use crate::wire::port::ReceiveError;
 #[derive(Debug, thiserror::Error)]
 pub enum FinalMapError {
     /// It does not answer.
-    #[error("the mapper does not respond; the map is that of its last checkpoint")]
+    #[error("the mapper does not respond; using the map of its last checkpoint")]
     Silent,
     /// It has ended.
-    #[error("the mapper is gone; the map is that of its last checkpoint")]
+    #[error("the mapper has exited; using the map of its last checkpoint")]
     Gone,
     /// Its signs of life cannot be received.
     #[error(transparent)]
     Receive(#[from] ReceiveError),
     /// It refuses, or takes too long.
-    #[error("{0}; the map is that of its last checkpoint")]
+    #[error("{0}; using the map of its last checkpoint")]
     Command(#[from] CommandError),
     /// Its file cannot be read.
     #[error(transparent)]

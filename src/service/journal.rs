@@ -94,8 +94,9 @@ impl Journal {
         let thread = std::thread::Builder::new()
             .name("semidense-journal".to_owned())
             .spawn(move || writer.write_all(&received))?;
-        let pointer = Pointer::set(place, &folder)
-            .inspect_err(|error| tracing::debug!("no pointer to the journal ({error})"));
+        let pointer = Pointer::set(place, &folder).inspect_err(|error| {
+            tracing::debug!("cannot write the pointer to the journal ({error})")
+        });
         let mut journal = Self::of(folder, held, Some((entries, thread)));
         (journal.pointer, journal.on_disk) = (pointer.ok(), on_disk);
         Ok(journal)
@@ -143,7 +144,7 @@ impl Journal {
         } else if !self.leaves_out {
             let folder = self.folder.display();
             tracing::warn!(
-                "{folder}: the disk does not answer; what comes now is missing in the journal"
+                "{folder}: the disk does not respond; further records will be missing from the journal"
             );
         }
         self.leaves_out = !has_room;
@@ -226,7 +227,7 @@ impl Journal {
         };
         if !is_whole && self.timeout > SECOND_TIMEOUT {
             let (folder, seconds) = (self.folder.display(), self.timeout.as_secs());
-            tracing::warn!("{folder}: the disk has not taken the journal within {seconds} s");
+            tracing::warn!("{folder}: the journal could not be written to disk within {seconds} s");
             self.timeout = SECOND_TIMEOUT;
         }
         is_whole
@@ -243,7 +244,7 @@ impl Journal {
     /// Removes the journal, once the results are written or where there are none.
     pub fn finish(mut self) -> io::Result<()> {
         if !self.close() {
-            return Err(io::Error::new(io::ErrorKind::TimedOut, "its disk does not answer"));
+            return Err(io::Error::new(io::ErrorKind::TimedOut, "its disk does not respond"));
         }
         remove_folder(&self.folder)?;
         drop(self.pointer.take().map(Pointer::clear));

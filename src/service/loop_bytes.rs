@@ -24,7 +24,7 @@ const SIDE: usize = 7;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum LoopBytesError {
     /// They are cut short, or followed by other bytes.
-    #[error("the loops are cut, or followed by something else")]
+    #[error("the loops are truncated or followed by extra bytes")]
     Length,
     /// A number is invalid.
     #[error("loop {0} is not a measurement between two keyframes")]

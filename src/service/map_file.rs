@@ -64,7 +64,7 @@ pub enum MapFault {
     #[error("it is not a map of this version")]
     Magic,
     /// A count exceeds that of any map.
-    #[error("{what} = {count} is more than any map has")]
+    #[error("{what} = {count} exceeds the limit of a map")]
     TooMany {
         /// What is counted.
         what: &'static str,

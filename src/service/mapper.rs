@@ -339,7 +339,7 @@ impl<'a> Shell<'a> {
             mapper.succeed(before);
             self.adjustments.orphan();
             if self.map.take().is_some() {
-                self.health.warn("another camera has come: its frames are not in the map on disk");
+                self.health.warn("the camera has changed: frames of the new one are not added to the map on disk");
             }
         }
         let left = self.left.take();
@@ -380,12 +380,10 @@ fn tell_search(report: &SearchReport) {
     let (keyframe, other) = (report.keyframe_id, report.other.unwrap_or(NO_KEYFRAME));
     match report.fate {
         SearchFate::Closed => {
-            tracing::info!(
-                "loop closed: keyframe {keyframe} sees what {other} shows; the map moves"
-            )
+            tracing::info!("loop closed: keyframe {keyframe} matches {other}; map corrected")
         }
         SearchFate::Joined => {
-            tracing::info!("epochs joined: keyframe {keyframe} sees what {other} shows")
+            tracing::info!("epochs joined: keyframe {keyframe} matches {other}")
         }
         _ => {}
     }

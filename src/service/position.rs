@@ -93,7 +93,7 @@ impl PositionKeeper {
     /// Writes the position of a frame that is about to be sent. A failure is logged once.
     pub fn note_or_warn(&mut self, position: &Position) {
         if let Some(Err(error)) = self.file.as_mut().map(|file| file.note(position)) {
-            tracing::warn!("the position in the source is not saved any more ({error})");
+            tracing::warn!("the position in the source is no longer saved ({error})");
             self.file = None;
         }
     }

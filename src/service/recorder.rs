@@ -88,7 +88,7 @@ impl Recorder {
             return;
         };
         if let Err(error) = keyframes.collect(journal, is_end) {
-            tracing::warn!("the journal gets no more keyframes: {error}");
+            tracing::warn!("no further keyframes are journalled: {error}");
             self.keyframes = None;
         }
     }

@@ -200,7 +200,7 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
     let mut scratch = ReferenceScratch::default();
     while !shared.stop.load(Ordering::Acquire) {
         if let Err(error) = wait(&[inbox.events()], None, WAKE_PERIOD) {
-            tracing::error!("no keyframes any more: {error}");
+            tracing::error!("no longer receiving keyframes: {error}");
             return;
         }
         match inbox.newest() {

@@ -43,7 +43,7 @@ impl RefusedImages {
             tracing::warn!("left out: {reason}");
             self.logged += 1;
             if self.logged == MAX_NAMED {
-                tracing::warn!("further images that are left out are only counted");
+                tracing::warn!("further images left out are only counted");
             }
         }
     }

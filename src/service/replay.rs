@@ -102,7 +102,7 @@ pub enum ReplayError {
     #[error(transparent)]
     Source(#[from] SourceError),
     /// The source failed later; the frames before are complete.
-    #[error("{cause}; the results are of the {} frames before", record.frames_in)]
+    #[error("{cause}; the results cover the {} frames before it", record.frames_in)]
     Cut {
         /// Everything up to then.
         record: Box<RunRecord>,

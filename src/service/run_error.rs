@@ -45,7 +45,7 @@ pub enum RunError {
     #[error("{0}: {1}")]
     Parameter(&'static str, ParameterError),
     /// Size and intrinsics are not those of a camera.
-    #[error("{0}: its size and intrinsics are not those of a camera; check its camera file or rig")]
+    #[error("{0}: invalid image size or intrinsics; check its camera file or rig")]
     Intrinsics(SourceName),
     /// The thread for this task cannot be started.
     #[error("cannot start the thread that {0} ({1})")]

@@ -131,7 +131,7 @@ pub fn soak(
     })?;
     // There are no results that would need it.
     if let Some(Err(error)) = outcome.journal.map(Journal::finish) {
-        tracing::warn!("the journal of the soak stays: {error}");
+        tracing::warn!("the journal of the soak run could not be removed: {error}");
     }
     match outcome.record.ended {
         EndOfRun::Failed(cause) => Err(TrialError::Ended(cause)),

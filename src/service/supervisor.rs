@@ -140,7 +140,7 @@ fn supervise(
     let num_poses = recorder.recording.num_poses();
     if let (EndOfRun::Failed(cause), true, frames @ 1..) = (&mut ended, is_cut, num_poses) {
         let of = if frames == 1 { "frame".to_owned() } else { format!("{frames} frames") };
-        let _ = write!(cause, "; the results are of the {of} before");
+        let _ = write!(cause, "; the results cover the {of} before it");
     }
     let lost = counters.frames_in.saturating_sub(num_poses as u64);
     if options.mode == Mode::Lockstep && ended == EndOfRun::Finished && lost > 0 {
@@ -166,7 +166,7 @@ fn begin_journal(options: &RunOptions, place: &Place) -> Option<Journal> {
     begun
         .inspect_err(|error| {
             tracing::warn!(
-                "no journal is kept ({error}); a kill of this process would lose the run"
+                "no journal is kept ({error}); if this process is killed, the run is lost"
             )
         })
         .ok()
@@ -454,7 +454,7 @@ impl<'a> Supervisor<'a> {
         let is_camera = self.options.source.is_camera();
         let last = self.processes[CAPTURE].peer.update()?.filter(|last| last.refused > 0);
         Ok(last.map(|last| match is_camera {
-            true => format!("{} left out: they came damaged", last.refused),
+            true => format!("{} left out as damaged", last.refused),
             false => cause(last),
         }))
     }

@@ -156,7 +156,7 @@ impl<'a> Shell<'a> {
             Err(_) => {
                 // Not logged: a sender of many such frames must not make this loop do I/O.
                 self.health.counters().refused += 1;
-                self.health.enter(ProcessState::Running, "a broken frame was refused");
+                self.health.enter(ProcessState::Running, "an invalid frame was refused");
                 return Ok(());
             }
         };
@@ -314,7 +314,7 @@ fn state_text(state: TrackingState) -> &'static str {
         }
         TrackingState::Degraded(DegradedReason::Gap) => "degraded: frames are missing",
         TrackingState::Degraded(DegradedReason::Turning) => {
-            "degraded: known depth is out of view, the last view holds the rotation"
+            "degraded: known depth is out of view; rotation is tracked on the last view"
         }
         TrackingState::Lost(LostReason::Diverged) => "lost: the keyframe is out of view",
         TrackingState::Lost(LostReason::TooFewInliers) => "lost: too few points match",

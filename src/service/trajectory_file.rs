@@ -71,10 +71,10 @@ pub enum LineFault {
     #[error("'{0}' is not a timestamp in {1}")]
     Stamp(String, &'static str),
     /// It is earlier than the previous line.
-    #[error("timestamp {0} is earlier than the one before: sort the file by time")]
+    #[error("timestamp {0} is earlier than the previous one: sort the file by time")]
     Order(String),
     /// Its quaternion has no direction.
-    #[error("the quaternion has no length: expected qx qy qz qw of length 1")]
+    #[error("the quaternion has zero length: expected qx qy qz qw of length 1")]
     Quaternion,
 }
 
@@ -249,7 +249,7 @@ pub fn write_epochs(path: &Path, comment: &str, poses: &[EpochPose]) -> io::Resu
         poses.iter().try_for_each(|of| {
             if !is_one && epoch.replace(of.epoch) != Some(of.epoch) {
                 let epoch = of.epoch;
-                writeln!(file, "{EPOCH_MARK}{epoch}: an origin and a unit of length of its own")?;
+                writeln!(file, "{EPOCH_MARK}{epoch}: a separate origin and unit of length")?;
             }
             writeln!(file, "{}", tum_line(&of.pose))
         })

@@ -59,7 +59,7 @@ impl ViewChild {
                 self.restarts += 1;
                 self.running = spawn(&self.options)
                     .inspect_err(|error| {
-                        tracing::warn!("the live page cannot be started again ({error})")
+                        tracing::warn!("the live page cannot be restarted ({error})")
                     })
                     .ok();
                 self.ended = Some(Instant::now());
@@ -68,9 +68,12 @@ impl ViewChild {
         };
         let line = lines.try_recv().ok();
         if let Ok(Some(status)) = child.try_wait() {
-            let next =
-                if self.restarts < MOST_RESTARTS { "it is started again" } else { "it stays away" };
-            tracing::warn!("the live page has ended ({status}); the run continues, {next}");
+            let next = if self.restarts < MOST_RESTARTS {
+                "and the page is restarted"
+            } else {
+                "without the page"
+            };
+            tracing::warn!("the live page exited ({status}); the run continues {next}");
             (self.running, self.ended) = (None, Some(Instant::now()));
         }
         line

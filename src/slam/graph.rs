@@ -84,7 +84,7 @@ pub enum SolveError {
     )]
     TooLarge,
     /// The constraints do not determine all poses.
-    #[error("the constraints do not determine the places of all vertices")]
+    #[error("the constraints do not determine the poses of all vertices")]
     Singular,
 }
 

@@ -147,7 +147,7 @@ pub enum CorrectionError {
     #[error("the join of epoch {0} is not a similarity, or joins the epoch to itself")]
     Join(u32),
     /// The unit is not finite, or not positive.
-    #[error("the map's unit is to be changed by a factor that is not positive and finite")]
+    #[error("the factor on the map's unit is not positive and finite")]
     Unit,
 }
 

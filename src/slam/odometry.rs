@@ -31,7 +31,7 @@ pub struct OdometryParams {
 pub enum OdometryError {
     /// Invalid size or intrinsics.
     #[error(
-        "size {} × {} and intrinsics {}, {}, {}, {} are not those of a camera",
+        "invalid camera: size {} × {}, intrinsics {}, {}, {}, {}",
         .0.width, .0.height, .0.fx, .0.fy, .0.cx, .0.cy
     )]
     Intrinsics(Intrinsics),

@@ -42,7 +42,7 @@ pub enum CommandError {
     #[error("{0}: a path may have at most {PATH_BYTES} bytes")]
     PathTooLong(PathBuf),
     /// A request of an unknown kind.
-    #[error("the mapper got a request that it does not know (kind {0})")]
+    #[error("the mapper received a request of unknown kind {0}")]
     Unknown(u32),
     /// The transport failed.
     #[error("mapper/command: {0}")]

@@ -44,7 +44,7 @@ pub enum MessageError {
         field: &'static str,
     },
     /// An invalid image size or invalid intrinsics.
-    #[error("size {width} × {height} and intrinsics are not those of a camera")]
+    #[error("invalid image size {width} × {height} or intrinsics")]
     InvalidIntrinsics {
         /// Width in pixels.
         width: u32,

@@ -31,7 +31,7 @@ pub enum OpenError {
     },
     /// The instance runs, but its topics cannot be opened from here.
     #[error(
-        "instance `{instance}` runs (process {holder}), but its shared memory is not in {SHARED_MEMORY}: it is just starting, or this container has a {SHARED_MEMORY} of its own (docker run --ipc=host shares the host's)"
+        "instance `{instance}` runs (process {holder}), but its shared memory is not in {SHARED_MEMORY}: it is just starting, or this container has its own {SHARED_MEMORY} (docker run --ipc=host shares the host's)"
     )]
     Elsewhere {
         /// Instance.
@@ -41,7 +41,7 @@ pub enum OpenError {
     },
     /// The instance has a different wire version.
     #[error(
-        "instance `{instance}` speaks wire version {found}, this program {WIRE_VERSION}: stop the old one, or use programs of one version"
+        "instance `{instance}` uses wire version {found}, this program {WIRE_VERSION}: stop the old one, or use programs of the same version"
     )]
     Version {
         /// Instance.
@@ -51,7 +51,7 @@ pub enum OpenError {
     },
     /// The topic has no room for another subscriber.
     #[error(
-        "topic {topic} has its {subscribers} subscribers: stop one of {holders}, or read what one of them passes on"
+        "topic {topic} already has its maximum of {subscribers} subscribers: stop one of {holders}, or use what one of them forwards"
     )]
     TooManySubscribers {
         /// Its name.
@@ -95,20 +95,20 @@ pub(in crate::wire) fn in_words(reason: &str) -> String {
     const CAUSES: [(&[&str], &str); 4] = [
         (
             &["ExceedsMaxNumberOfNodes", "ExceedsMaxSupported"],
-            "as many programs take part as there is room for; stop one that reads this instance",
+            "the instance has no room for another program; stop one that reads it",
         ),
         (
             &["HangsInCreation", "ServiceInCorruptedState"],
-            "another process has made it, but its shared memory is not in /dev/shm here; containers that share a runtime \
+            "another process created it, but its shared memory is not in /dev/shm here; containers that share a runtime \
              folder must share /dev/shm (docker run --ipc=host), else set SEMIDENSE_ROOT to a folder for each",
         ),
         (
             &["InsufficientPermissions", "PermissionDenied"],
-            "another user has made it; run as that user, or set SEMIDENSE_ROOT to a folder of yours",
+            "another user created it; run as that user, or set SEMIDENSE_ROOT to a folder of your own",
         ),
         (
             &["InternalFailure", "InternalError", "UnableToCreate", "Unable"],
-            "the system refuses files or memory for it; look at ulimit -n, ulimit -v and the space in /dev/shm and the \
+            "the system refuses files or memory for it; check ulimit -n, ulimit -v and the space in /dev/shm and the \
              runtime folder (semidense doctor lists them)",
         ),
     ];
@@ -127,7 +127,7 @@ mod tests {
         let files = in_words("EventCreateError(InternalFailure)");
         assert!(files.contains("ulimit -n"), "{files}");
         let full = in_words("EventOpenError::ExceedsMaxNumberOfNodes");
-        assert!(full.starts_with("as many programs take part"), "{full}");
+        assert!(full.starts_with("the instance has no room for another program"), "{full}");
         assert_eq!(in_words("IncompatibleTypes"), "IncompatibleTypes");
     }
 }

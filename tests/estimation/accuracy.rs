@@ -1,6 +1,6 @@
-//! Accuracy on simulated rooms, whose poses and depth are exact, and on recordings of real cameras
-//! where these are on the machine. The full measurement of the default room takes minutes:
-//! `cargo test --release --test estimation accuracy -- --ignored --nocapture`.
+//! Accuracy in simulated rooms, whose poses and depth are exact, and on recordings of real cameras if these are on the
+//! machine. The full measurement of the default room takes minutes: `cargo test --release --test estimation accuracy
+//! -- --ignored --nocapture`.
 
 use crate::figures::{Figure, hold};
 use crate::recording::{recording, say};
@@ -9,11 +9,11 @@ use serde_json::Value;
 use std::path::Path;
 use tempfile::TempDir;
 
-/// Limits of the default room: error of the path, and median relative error of depth.
+/// Limits for the default room: error per length of path, and median relative error of depth.
 const MAX_ATE_PER_PATH: f64 = 0.01;
 const MAX_DEPTH_ERROR: f64 = 0.05;
 
-/// `replay` of a source into the folder of its own, its summary.
+/// Replays a source into a separate folder; returns its summary.
 fn replay(source: &str, arguments: &[String]) -> Value {
     let rig = Rig::new();
     let mut command = rig.command(&["replay", source, "--json", "--output"]);
@@ -32,7 +32,7 @@ fn median(mut values: Vec<f64>) -> f64 {
     values[values.len() / 2]
 }
 
-/// Replays the default room with each seed and holds the medians to the limits.
+/// Replays the default room with each seed and checks the medians against the limits.
 fn assert_room_is_accurate(seeds: std::ops::RangeInclusive<u64>, settings: &[&str]) {
     let (mut ates, mut depths) = (Vec::new(), Vec::new());
     for seed in seeds {
@@ -50,7 +50,7 @@ fn assert_room_is_accurate(seeds: std::ops::RangeInclusive<u64>, settings: &[&st
             figures["frames_in"]
         ));
         assert_eq!(figures["lost_count"], 0, "seed {seed}: {figures}");
-        // All but the second that it may take to begin a map.
+        // All frames except for the second that the start of a map may take.
         let missed = number(&figures, "frames_in") - number(&figures, "frames_tracked");
         assert!(missed <= 30.0, "seed {seed}: {missed} frames without a pose");
         ates.push(ate);
@@ -62,7 +62,7 @@ fn assert_room_is_accurate(seeds: std::ops::RangeInclusive<u64>, settings: &[&st
 }
 
 #[test]
-fn a_short_way_through_the_room_is_accurate() {
+fn a_short_path_through_the_room_is_accurate() {
     let half_size = [
         "simulator.frames=150",
         "simulator.width=320",
@@ -78,8 +78,8 @@ fn the_default_room_is_accurate() {
     assert_room_is_accurate(1..=5, &[]);
 }
 
-/// Replays a recording with portable arithmetic, which is the same bits on every machine, and holds its figures
-/// against the table.
+/// Replays a recording with portable arithmetic, which gives the same bits on every machine, and compares its figures
+/// with the table.
 fn assert_recording_is_as_before(name: &str) {
     let Some(folder) = recording(name) else { return };
     let arguments =
@@ -96,7 +96,7 @@ fn assert_recording_is_as_before(name: &str) {
         Figure::new("window_error_m", number(&found, "window_error_m"), 0.0003),
         Figure::new("nees_median", number(&found, "nees_median"), 0.05),
     ];
-    // Short recordings have one window, and not all have true depth.
+    // Short recordings have a single window, and not all have true depth.
     let ratio = found["window_scale_ratio"].as_f64();
     figures.extend(ratio.map(|ratio| Figure::new("scale_drift", ratio - 1.0, 0.01)));
     let error = found["depth_relative_error_median"].as_f64();
@@ -114,26 +114,26 @@ fn assert_recording_is_as_before(name: &str) {
 }
 
 #[test]
-fn redkitchen_is_as_before() {
+fn redkitchen_has_the_pinned_figures() {
     assert_recording_is_as_before("redkitchen");
 }
 
 #[test]
-fn the_floor_is_as_before() {
+fn the_floor_has_the_pinned_figures() {
     assert_recording_is_as_before("fr1-floor");
 }
 
 #[test]
-fn the_rendered_desk_is_as_before() {
+fn the_rendered_desk_has_the_pinned_figures() {
     assert_recording_is_as_before("tsukuba");
 }
 
 #[test]
-fn the_rendered_office_is_as_before() {
+fn the_rendered_office_has_the_pinned_figures() {
     assert_recording_is_as_before("icl-office3");
 }
 
-/// Every `step`-th frame of a recording, from the first, in a folder of its own.
+/// Every `step`-th frame of a recording, from the first, in a separate folder.
 fn thinned(recording: &Path, step: usize) -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     for name in ["camera.txt", "groundtruth.txt", "rgb"] {
@@ -145,14 +145,14 @@ fn thinned(recording: &Path, step: usize) -> TempDir {
     folder
 }
 
-/// The parallax between these frames is beyond the usual search for new pixels. Without a longer one each keyframe has less
-/// depth than the one before, and the camera is lost on the way, at an error of 0.03 to 0.2 m.
+/// The parallax between these frames exceeds the usual search range for new pixels. Without a longer one each keyframe
+/// has less depth than the previous one, and the camera is lost on the way, with an error of 0.03 to 0.2 m.
 #[test]
 fn frames_far_apart_do_not_starve_the_keyframes_of_depth() {
     /// Twice the worst of seven first frames.
     const MAX_ATE_M: [(usize, f64); 3] = [(2, 0.008), (3, 0.012), (4, 0.031)];
     let Some(desk) = recording("tsukuba") else { return };
-    // A relative target of a link would be looked for beside the link.
+    // The relative target of a link would be resolved next to the link.
     let desk = desk.canonicalize().unwrap();
     for (step, max_ate_m) in MAX_ATE_M {
         let folder = thinned(&desk, step);

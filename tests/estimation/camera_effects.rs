@@ -1,7 +1,7 @@
-//! What a real camera adds to the picture: changes of exposure, noise, motion blur. With all of it the
-//! simulated room is still tracked without a loss, at less than twice the error. A vignette, which
-//! nothing corrects, costs more; what each effect costs by itself says
-//! `cargo test --release --test estimation camera_effects -- --ignored --nocapture`.
+//! Effects of a real camera on the image: changes of exposure, noise, motion blur. With all of them the simulated room
+//! is still tracked without a loss, at less than twice the error. A vignette, which nothing corrects, costs more; the
+//! cost of each effect alone is printed by `cargo test --release --test estimation camera_effects -- --ignored
+//! --nocapture`.
 
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::{SensorParams, SimulatorParams};
@@ -13,12 +13,12 @@ use semidense::slam::evaluation::{MAX_DIFFERENCE_NANOS, evaluate_trajectory};
 use semidense::slam::pose::TrackingState;
 use semidense::slam::trajectory::StampedPose;
 
-/// Half a second may pass until the map begins; frames between that and the end.
+/// Half a second may pass until the map starts; frames from then to the end.
 const FRAMES: usize = 200;
-/// Rooms, of whose errors the median is taken: single ones differ by a factor of five.
+/// Seeds of the rooms, whose median error is taken: single errors differ by a factor of five.
 const SEEDS: std::ops::RangeInclusive<u64> = 1..=5;
 
-/// Trajectory of the final map against the truth, share of the path; frames lost and tracked.
+/// Error of the final map's trajectory relative to the path; frames lost and tracked.
 struct Outcome {
     ate_per_path: f64,
     lost: usize,
@@ -48,7 +48,7 @@ fn outcome(seed: u64, sensor: &SensorParams) -> Outcome {
     }
 }
 
-/// The claimed poses as they were published.
+/// The claimed poses as published.
 fn trajectory(record: &RunRecord) -> Vec<StampedPose> {
     let poses = record.poses.iter().map(|pose| pose.estimate);
     let tracked = poses.filter(|pose| pose.state.is_tracked());
@@ -59,7 +59,7 @@ fn trajectory(record: &RunRecord) -> Vec<StampedPose> {
     stamped.collect()
 }
 
-/// Median error over the seeds; no loss in any.
+/// Median error over the seeds, none of which may have a loss.
 fn median_error(name: &str, sensor: &SensorParams) -> f64 {
     let mut errors = Vec::new();
     for seed in SEEDS {
@@ -78,8 +78,8 @@ fn median_error(name: &str, sensor: &SensorParams) -> f64 {
     median
 }
 
-/// Each effect as strong as in a room with a cheap camera: half again the usual noise, an exposure that
-/// changes by a third either way, 10 ms of blur.
+/// Each effect as strong as in a room with a cheap camera: one and a half times the usual noise, an exposure that
+/// varies by a third in either direction, 10 ms of blur.
 fn effects() -> SensorParams {
     SensorParams {
         noise_std_dev: 3.0,
@@ -91,7 +91,7 @@ fn effects() -> SensorParams {
 }
 
 #[test]
-fn effects_of_a_camera_do_not_double_the_error() {
+fn camera_effects_do_not_double_the_error() {
     let clean = median_error("without", &SensorParams::default());
     let all = median_error("with all", &effects());
     assert!(all < 2.0 * clean, "{all} with effects, {clean} without");

@@ -1,6 +1,6 @@
-//! Depth of every keyframe against exact truth, in simulated rooms with exact poses and with the program's own, and in
-//! a rendered office: its bias, its tilt and its relief. The median error hides what is common to a keyframe, and
-//! poses absorb it. How large it is today is in the table `tests/figures.toml`.
+//! Depth of every keyframe compared with exact truth, in simulated rooms with exact and with estimated poses, and in a
+//! rendered office: its bias, its tilt and its relief. The median error hides errors common to a keyframe, and poses
+//! absorb them. Their current size is in the table `tests/figures.toml`.
 
 use crate::figures::{Figure, hold};
 use crate::recording::recording;
@@ -17,17 +17,17 @@ use semidense::slam::kernel::SimdMode;
 /// Frames of a room.
 const FRAMES: usize = 150;
 
-/// Shares of the pixels within 1, 2 and 3 σ below which depth is over-sure, and above which it is over-cautious.
+/// Shares of the pixels within 1, 2 and 3 σ below which depth is overconfident, and above which it is underconfident.
 const LEAST_COVERAGE: [f64; 3] = [0.55, 0.85, 0.90];
 const MOST_COVERAGE: [f64; 3] = [0.80, 0.98, 1.0];
 
-/// What is common to a keyframe's depth, by keyframe, and the depth errors of all.
+/// The common errors of each keyframe's depth, and the depth errors of all.
 struct Outcome {
     modes: Vec<DepthModes>,
     errors: DepthErrors,
 }
 
-/// Portable arithmetic is the same bits on every machine.
+/// Portable arithmetic gives the same bits on every machine.
 fn config(poses: PoseOrigin) -> ReplayConfig {
     let mut config = ReplayConfig { poses, ..ReplayConfig::default() };
     config.tracker.alignment.simd = SimdMode::Portable;
@@ -46,7 +46,7 @@ fn outcome(source: &mut dyn FrameSource, name: &str, poses: PoseOrigin) -> Outco
     for keyframe in record.map.keyframes.iter().filter(|keyframe| !keyframe.points.is_empty()) {
         let truth = source.depth_at(keyframe.capture_nanos).unwrap().unwrap();
         errors.add(keyframe, &truth, record.depth_scale);
-        // The unit of estimated poses is not metres: only what differs within a keyframe can be judged.
+        // Estimated poses have no metric unit: only differences within a keyframe can be judged.
         let unit = match record.depth_scale {
             DepthScale::Given => keyframe.map_from_keyframe.scale,
             DepthScale::MedianRatio => 1.0,
@@ -68,7 +68,7 @@ fn worst_and_mean(outcomes: &[Outcome], mode: Mode) -> (f64, f64) {
     (worst, all.iter().sum::<f64>() / all.len() as f64)
 }
 
-/// Tilt and relief over all keyframes, their worst and their mean.
+/// Worst and mean tilt and relief over all keyframes.
 fn mode_figures(outcomes: &[Outcome], slack: f64) -> Vec<Figure> {
     let modes: [(&str, &str, Mode); 3] = [
         ("column_worst", "column_mean", |m| m.column),
@@ -82,7 +82,7 @@ fn mode_figures(outcomes: &[Outcome], slack: f64) -> Vec<Figure> {
     figures.collect()
 }
 
-/// Holds the shares within 1, 2 and 3 σ to bounds.
+/// Checks the shares within 1, 2 and 3 σ against bounds.
 fn assert_coverage(outcomes: &[Outcome], least: [f64; 3], most: [f64; 3]) {
     for outcome in outcomes {
         let coverage = outcome.errors.statistics().unwrap().coverage;
@@ -94,7 +94,7 @@ fn assert_coverage(outcomes: &[Outcome], least: [f64; 3], most: [f64; 3]) {
 }
 
 #[test]
-fn with_exact_poses_depth_has_no_bias_no_tilt_and_its_relief() {
+fn with_exact_poses_depth_has_no_bias_no_tilt_and_keeps_its_relief() {
     let outcomes = [1, 2, 3].map(|seed| room(seed, PoseOrigin::GroundTruth));
     assert_coverage(&outcomes, LEAST_COVERAGE, MOST_COVERAGE);
     let (worst, mean) = worst_and_mean(&outcomes, |m| m.scale);
@@ -105,10 +105,10 @@ fn with_exact_poses_depth_has_no_bias_no_tilt_and_its_relief() {
 }
 
 #[test]
-fn with_own_poses_depth_is_hardly_tilted_and_keeps_its_relief() {
+fn with_estimated_poses_depth_is_hardly_tilted_and_keeps_its_relief() {
     let outcomes = [1, 2, 3].map(|seed| room(seed, PoseOrigin::Tracker));
     hold("rooms-own-poses", &mode_figures(&outcomes, 0.005));
-    // Half as many pixels as the rooms that the line noise was chosen with.
+    // Half as many pixels as the rooms for which the line noise was chosen.
     assert_coverage(&outcomes, LEAST_COVERAGE, [0.86, 0.98, 1.0]);
 }
 

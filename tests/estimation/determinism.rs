@@ -1,4 +1,4 @@
-//! The same bits for any number of threads, and for three processes as for one, on a sequence that
+//! Bit-identical results for any number of threads, and for three processes as for one, on a sequence that
 //! initialises, tracks and changes keyframes.
 
 use std::fs;
@@ -15,11 +15,11 @@ const SETTINGS: [&str; 4] = [
     "simulator.height=240",
     "simulator.focal_px=262.5",
 ];
-/// What must be equal.
+/// Files that must be equal.
 const FILES: [&str; 5] =
     ["trajectory.txt", "trajectory_online.txt", "keyframes.txt", "map.ply", "points.ply"];
 
-/// Runs a command of the binary on the sequence and gives its summary.
+/// Runs a command of the binary on the sequence and returns its summary.
 fn summary(mut command: Command, output: &Path) -> Value {
     for setting in SETTINGS {
         command.args(["--set", setting]);
@@ -34,7 +34,7 @@ fn contents(output: &Path) -> [Vec<u8>; FILES.len()] {
     FILES.map(|name| fs::read(output.join(name)).unwrap())
 }
 
-/// Compares file by file, so that a failure names the file and not a megabyte of bytes.
+/// Compares file by file, so that a failure names the file instead of printing a megabyte of bytes.
 fn assert_same(one: &[Vec<u8>], other: &[Vec<u8>], what: &str) {
     for (name, (one, other)) in FILES.iter().zip(one.iter().zip(other)) {
         assert!(one == other, "{name} differs: {what}");
@@ -49,7 +49,7 @@ fn threads_and_processes_do_not_change_a_bit() {
         let figures = summary(rig.command(&["replay", "sim", "--threads", threads]), &output);
         // Equal files of a run that never tracked would prove nothing.
         assert!(figures["frames_tracked"].as_u64().unwrap() >= 45, "{figures}");
-        // … as would those of one whose keyframes were not estimated jointly.
+        // … nor would those of one whose keyframes were not estimated jointly.
         assert!(figures["adjustments"].as_u64().unwrap() >= 3, "{figures}");
         contents(&output)
     });
@@ -63,7 +63,7 @@ fn threads_and_processes_do_not_change_a_bit() {
 }
 
 #[test]
-fn poses_that_a_run_has_only_in_its_journal_are_those_of_a_replay() {
+fn poses_that_a_run_keeps_only_in_its_journal_equal_those_of_a_replay() {
     let rig = Rig::new();
     // Three hundred are written at a time.
     let long = "loop:900:30:sim";
@@ -99,14 +99,14 @@ fn no_depth_filter_depends_on_the_number_of_threads() {
 }
 
 #[test]
-fn points_of_either_filter_and_passes_do_not_depend_on_the_number_of_threads() {
+fn results_of_either_filter_and_of_passes_do_not_depend_on_the_number_of_threads() {
     let rig = Rig::new();
     let of = |threads: &str, source: &str, every: &str| {
         let output = rig.folder().join(format!("{threads}-{source}-{every}"));
         let mut arguments = vec!["replay", "sim", "--threads", threads];
         let source = format!("mapping.window.points_from=\"{source}\"");
         let every = format!("mapping.window.pass_every={every}");
-        // Keyframes of a short sequence are few: a pass begins with the third.
+        // A short sequence has few keyframes: a pass begins with the third.
         let few = ["mapping.window.num_first=2", "mapping.window.num_free=2"];
         for chosen in [&source, &every].map(String::as_str).into_iter().chain(few) {
             arguments.extend(["--set", chosen]);

@@ -1,5 +1,5 @@
-//! `semidense evaluate` against figures that the Python package `evo` 1.38.1 gave on the same files
-//! (`evo_ape` with `-a -s`, `-a` or neither, `evo_rpe` with `--delta 1 --delta_unit f --all_pairs`).
+//! `semidense evaluate` compared with the figures of the Python package `evo` 1.38.1 for the same files (`evo_ape`
+//! with `-a -s`, `-a` or neither, `evo_rpe` with `--delta 1 --delta_unit f --all_pairs`).
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -8,7 +8,7 @@ use nalgebra::Vector6;
 use semidense::slam::geometry::se3::SE3;
 use serde_json::Value;
 
-/// Largest difference of two figures of the same meaning.
+/// Largest difference of two equivalent figures.
 const TOLERANCE: f64 = 1e-6;
 
 fn fixtures() -> PathBuf {
@@ -28,7 +28,7 @@ fn number(value: &Value) -> f64 {
 }
 
 #[test]
-fn figures_are_those_of_evo() {
+fn figures_equal_those_of_evo() {
     let text = std::fs::read_to_string(fixtures().join("figures.json")).unwrap();
     let figures: Value = serde_json::from_str(&text).unwrap();
     let cases = figures["cases"].as_array().unwrap();
@@ -64,7 +64,7 @@ fn figures_are_those_of_evo() {
     }
 }
 
-/// Ground truth in EuRoC's layout of a body that carries the camera of `world_from_cameras`.
+/// Ground truth in EuRoC layout for a body that carries the camera of `world_from_cameras`.
 fn write_euroc(folder: &Path, body_from_camera: &SE3, world_from_cameras: &[(i64, SE3)]) {
     let poses = folder.join("mav0/state_groundtruth_estimate0");
     std::fs::create_dir_all(&poses).unwrap();
@@ -97,7 +97,7 @@ fn ground_truth_of_a_body_is_moved_to_its_camera() {
         (1_000_000_000 + i * 50_000_000, pose)
     };
     let cameras: Vec<_> = (0..60).map(path).collect();
-    // The camera as mounted on EuRoC's helicopter: turned by a right angle and some.
+    // The camera as mounted on EuRoC's helicopter: rotated by slightly more than a right angle.
     let turned = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.02, -0.01, 1.556));
     let aside = SE3::exp(&Vector6::new(-0.1, 0.3, 0.05, 0.02, -0.01, 1.556));
     for body_from_camera in [turned, aside] {
@@ -131,7 +131,7 @@ fn ground_truth_of_a_body_is_moved_to_its_camera() {
                 );
             }
         }
-        // The same truth in TUM layout: `--sensor` says that it is the body's.
+        // The same truth in TUM layout: `--sensor` declares it to be the body's.
         let tum = folder.path().join("truth.txt");
         let text = std::fs::read_to_string(&alone).unwrap();
         let as_tum = |line: &str| {
@@ -145,7 +145,7 @@ fn ground_truth_of_a_body_is_moved_to_its_camera() {
         let (moved, _) = figures(&tum, &["--sensor", &sensor]);
         assert!(number(&moved["rpe_translation"]) < TOLERANCE, "{moved}");
 
-        // An estimate of the body's poses has the figures of the camera's.
+        // An estimate of the body's poses has the same figures as the camera's.
         let bend = |(i, (nanos, pose)): (usize, &(i64, SE3))| {
             let off = (i as f64).sin() * 0.01;
             (*nanos, *pose * SE3::exp(&Vector6::new(off, 0.0, -off, off, 0.0, 2.0 * off)))
@@ -165,14 +165,14 @@ fn ground_truth_of_a_body_is_moved_to_its_camera() {
             assert!(off.abs() < TOLERANCE, "{key} of the body's poses: {body}");
             assert!(number(&body[key]) > 1e-3, "{key}: {body}");
         }
-        // Positions are the same where camera and body are in one place; relative motions never.
+        // Positions agree if camera and body coincide; relative motions never do.
         let is_aside = body_from_camera.translation.norm() > 0.0;
         assert_eq!(number(&by_body["ate_rmse_m"]) > 1e-3, is_aside, "{by_body}");
         assert!(number(&by_body["rpe_translation"]) > 1e-3, "{by_body}");
     }
 }
 
-/// Lines of a trajectory file: every pose of `poses` seen in another frame, at another scale.
+/// Lines of a trajectory file: every pose of `poses` in another coordinate frame, at another scale.
 fn tum_lines(poses: &[(i64, SE3)], other_from_world: &SE3, scale: f64) -> String {
     let line = |(nanos, pose): &(i64, SE3)| {
         let other = *other_from_world * *pose;
@@ -182,7 +182,7 @@ fn tum_lines(poses: &[(i64, SE3)], other_from_world: &SE3, scale: f64) -> String
     poses.iter().map(line).collect()
 }
 
-/// An estimate of three epochs, of two poses the last, beside its ground truth.
+/// An estimate with three epochs, the last of two poses, and its ground truth.
 fn write_epochs(folder: &Path) -> [String; 2] {
     let path = |i: i64| {
         let s = i as f64 / 20.0;
@@ -210,7 +210,7 @@ fn write_epochs(folder: &Path) -> [String; 2] {
 }
 
 #[test]
-fn every_epoch_that_is_marked_is_judged_by_itself() {
+fn every_marked_epoch_is_evaluated_separately() {
     let folder = tempfile::tempdir().unwrap();
     let [estimate, truth] = write_epochs(folder.path());
     let json = |estimate: &str| -> Value {
@@ -246,7 +246,7 @@ fn every_epoch_that_is_marked_is_judged_by_itself() {
     }
     assert!(text.contains("total of 2 epochs, over all matched poses:\n100 of 102"), "{text}");
 
-    // Without marks it is one path, as a file of any other program is.
+    // Without marks it is one path, like a file of any other program.
     let all = std::fs::read_to_string(&estimate).unwrap();
     let unmarked = folder.path().join("unmarked.txt").display().to_string();
     let lines = all.lines().filter(|line| !line.starts_with("# epoch"));
@@ -256,7 +256,7 @@ fn every_epoch_that_is_marked_is_judged_by_itself() {
     assert_eq!(one["epochs"].as_array().unwrap().len(), 1);
     assert_eq!(one["epochs"][0]["ate_rmse_m"], one["ate_rmse_m"]);
     assert!(!String::from_utf8(evaluate(&[&unmarked, &truth]).stdout).unwrap().contains("epoch"));
-    // An epoch alone is what it is beside others.
+    // An epoch alone has the same figures as among others.
     let end = all.find("# epoch 0: x\n").unwrap()..all.find("# epoch 1: x\n").unwrap();
     let begin = all.rfind("# epoch 0: x\n").unwrap()..all.find("# epoch 2: x\n").unwrap();
     std::fs::write(&unmarked, all[end].to_owned() + &all[begin]).unwrap();
@@ -279,7 +279,7 @@ fn every_epoch_that_is_marked_is_judged_by_itself() {
 }
 
 #[test]
-fn hostile_files_are_refused_in_one_line_that_names_the_place() {
+fn malformed_files_are_refused_in_one_line_that_names_the_position() {
     let folder = tempfile::tempdir().unwrap();
     let truth = fixtures().join("truth_100hz.txt").display().to_string();
     let pose = "0 0 0 0 0 0 1\n";
@@ -291,7 +291,7 @@ fn hostile_files_are_refused_in_one_line_that_names_the_place() {
         ("1 nan 0 0 0 0 0 1\n".to_owned(), &[":1:", "finite"]),
         ("1 0 0 0 0 0 0 0\n".to_owned(), &[":1:", "quaternion"]),
         (format!("1 {pose}2 {pose}3 {pose}"), &["0 of 3 poses", "clock"]),
-        (format!("1305033528 {pose}1305033529 {pose}1305033530 {pose}"), &["stands still"]),
+        (format!("1305033528 {pose}1305033529 {pose}1305033530 {pose}"), &["does not move"]),
     ] {
         let path = folder.path().join("estimate.txt");
         std::fs::write(&path, &content).unwrap();
@@ -309,7 +309,7 @@ fn hostile_files_are_refused_in_one_line_that_names_the_place() {
 }
 
 #[test]
-fn the_plot_is_a_whole_picture() {
+fn the_plot_is_a_complete_picture() {
     let folder = tempfile::tempdir().unwrap();
     let plot = folder.path().join("plot.svg");
     let path = |name: &str| fixtures().join(name).display().to_string();

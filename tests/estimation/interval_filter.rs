@@ -1,5 +1,5 @@
-//! The interval filter on simulated hand-held sequences with exact poses: how often an interval holds
-//! the true depth, and that it narrows as the baseline grows.
+//! The interval filter on simulated handheld sequences with exact poses: how often an interval contains the true
+//! depth, and that it narrows as the baseline grows.
 
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::{SensorParams, SimulatorParams};
@@ -13,7 +13,7 @@ use semidense::slam::image::buffer::Image;
 use semidense::slam::image::quads::QuadImage;
 use semidense::slam::pose::Brightness;
 
-/// Frames that one keyframe is traced through: 0.8 s, 0.4 m of a slow walk.
+/// Frames through which one keyframe is traced: 0.8 s, 0.4 m of a slow walk.
 const FRAMES: usize = 24;
 
 struct Sequence {
@@ -45,7 +45,7 @@ fn sequence(seed: u64, noise_std_dev: f64) -> Sequence {
     Sequence { keyframe, depth, frames }
 }
 
-/// Shares of `Good` traces whose interval holds the truth.
+/// Counts of `Good` traces, and of those whose interval contains the truth.
 #[derive(Debug, Default)]
 struct Coverage {
     good: usize,
@@ -85,7 +85,7 @@ impl Coverage {
         println!("mature within 1, 2, 3 σ: {:.3?}", [1.0, 2.0, 3.0].map(|s| self.within(s)));
     }
 
-    /// Share of mature points whose error is within so many σ.
+    /// Share of mature points whose error is within `sigmas` σ.
     fn within(&self, sigmas: f32) -> f64 {
         let inside = self.whitened_errors.iter().filter(|e| **e <= sigmas).count();
         inside as f64 / self.whitened_errors.len() as f64
@@ -122,14 +122,14 @@ fn coverage(noise_std_dev: f64) -> Coverage {
 }
 
 #[test]
-fn without_noise_sure_traces_hold_the_truth() {
+fn without_noise_certain_traces_contain_the_truth() {
     let coverage = coverage(0.0);
     assert!(coverage.sure > 10_000, "{}", coverage.sure);
     assert!(coverage.sure_holds * 100 >= coverage.sure * 95);
 }
 
 #[test]
-fn with_the_noise_of_a_camera_most_sure_traces_hold_the_truth() {
+fn with_camera_noise_most_certain_traces_contain_the_truth() {
     let coverage = coverage(3.0);
     assert!(coverage.sure > 10_000, "{}", coverage.sure);
     assert!(coverage.sure_holds * 100 >= coverage.sure * 85);

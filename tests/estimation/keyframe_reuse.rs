@@ -1,5 +1,5 @@
-//! A camera that goes back and forth: keyframes it comes back to are taken up again, so that the map does not
-//! grow and the poses do not get worse.
+//! A camera that moves back and forth: keyframes that it returns to are reused, so that the map does not grow and the
+//! poses do not degrade.
 
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::{MotionKind, MotionParams, SimulatorParams};
@@ -11,12 +11,12 @@ use semidense::slam::mapper::MapperParams;
 use semidense::slam::mapper::reuse::ReuseParams;
 use semidense::slam::trajectory::StampedPose;
 
-/// Frames of the sequence: twice there and back.
+/// Frames of the sequence: back and forth twice.
 const FRAMES: usize = 420;
 
 struct Outcome {
     record: RunRecord,
-    /// Keyframes taken up again.
+    /// Number of reused keyframes.
     restored: usize,
     ate: f64,
 }
@@ -54,7 +54,7 @@ fn back_and_forth(max_distance: f64) -> Outcome {
 }
 
 #[test]
-fn going_back_and_forth_does_not_grow_the_map() {
+fn moving_back_and_forth_does_not_grow_the_map() {
     let without = back_and_forth(0.0);
     let with = back_and_forth(ReuseParams::default().max_distance);
     assert_eq!(without.restored, 0);

@@ -1,5 +1,5 @@
-//! What tracker and mapper come to: accuracy and its figures, the start, loss and recovery, noise, the same bits for any
-//! number of threads.
+//! Behaviour of tracker and mapper: accuracy and its figures, the start, loss and recovery, noise, bit-identical
+//! results for any number of threads.
 
 #[path = "../support/figures.rs"]
 mod figures;

@@ -1,5 +1,5 @@
-//! A map that is corrected in the middle of a run: everything that follows agrees with the correction, and
-//! nothing else changes.
+//! A map that is corrected in the middle of a run: everything that follows agrees with the correction, and nothing
+//! else changes.
 
 use std::sync::LazyLock;
 
@@ -26,7 +26,7 @@ use semidense::slam::tracker::{Tracker, TrackerParams};
 const FRAMES: usize = 90;
 /// The frame after which the map is corrected.
 const CORRECTED_AT: usize = 60;
-/// Time from frame to frame.
+/// Time between frames.
 const PERIOD_NANOS: i64 = 33_333_333;
 
 /// A simulated sequence.
@@ -35,7 +35,7 @@ struct Footage {
     frames: Vec<Vec<u8>>,
 }
 
-/// Rendered once for all tests of a process.
+/// Rendered once per process, for all tests.
 static FOOTAGE: LazyLock<Footage> = LazyLock::new(footage);
 
 fn footage() -> Footage {
@@ -70,7 +70,7 @@ impl<'a> Run<'a> {
         Self { footage, tracker, mapper, poses: Vec::new() }
     }
 
-    /// Shows a frame as the next one.
+    /// Processes `pixels` as the next frame.
     fn show(&mut self, pixels: &[u8]) {
         let sequence = self.poses.len() as u64;
         let capture_nanos = sequence as i64 * PERIOD_NANOS;
@@ -101,7 +101,7 @@ impl<'a> Run<'a> {
     }
 }
 
-/// A correction that moves every keyframe of the map by its own similarity.
+/// A correction that moves every keyframe of the map by a separate similarity.
 fn moved(map: &Map, move_one: impl Fn(&Sim3) -> Sim3) -> Correction {
     let keyframes = map.keyframes.iter().map(|keyframe| KeyframeCorrection {
         keyframe_id: keyframe.keyframe_id,
@@ -113,17 +113,17 @@ fn moved(map: &Map, move_one: impl Fn(&Sim3) -> Sim3) -> Correction {
     Correction { keyframes: keyframes.collect(), ..Correction::default() }
 }
 
-/// A correction that gives the whole map another place and unit.
+/// A correction that gives the whole map another gauge.
 fn regauged(map: &Map, new_from_map: &Sim3) -> Correction {
     Correction { unit: Some(new_from_map.scale), ..moved(map, |place| *new_from_map * *place) }
 }
 
-/// How far two poses are apart, in units of their own and radians together.
+/// Distance between two poses: their units and radians combined.
 fn distance(one: &SE3, other: &SE3) -> f64 {
     (one.inverse() * *other).log().norm()
 }
 
-/// Pixels between where two maps have the points of one keyframe in the view of another.
+/// Largest distance in pixels between the projections of one keyframe's points into another, by two maps.
 fn reprojection_error(one: (&Map, [usize; 2]), other: &Map) -> f64 {
     let (map, [from, to]) = one;
     let seen = |map: &Map| {
@@ -150,7 +150,7 @@ fn similarity() -> impl Strategy<Value = Sim3> {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 4, ..ProptestConfig::default() })]
 
-    /// Another place and unit for the whole map says nothing about what is in it.
+    /// Another pose and unit for the whole map does not affect its content.
     #[test]
     fn another_gauge_changes_nothing_but_the_gauge(new_from_map in similarity()) {
         let footage = &*FOOTAGE;
@@ -193,7 +193,7 @@ proptest! {
             }
             let error = distance(&expected, &other.map_from_camera);
             prop_assert!(error < 1e-6 * new_from_map.scale.max(1.0), "map, frame {frame}: {error}");
-            // Frames from before follow their keyframes.
+            // Earlier frames follow their keyframes.
             let placed = after.place(other.keyframe_id, &other.keyframe_from_camera);
             if let Some(placed) = placed.filter(|_| one.state == TrackingState::Tracking) {
                 let published = before.place(one.keyframe_id, &one.keyframe_from_camera).unwrap();
@@ -204,9 +204,9 @@ proptest! {
     }
 }
 
-/// Keyframes that move against each other take their frames along, and odometry stands still.
+/// Keyframes that move relative to each other take their frames along, and odometry does not move.
 #[test]
-fn what_moves_takes_its_frames_along() {
+fn moved_keyframes_take_their_frames_along() {
     let footage = &*FOOTAGE;
     let mut run = Run::new(footage);
     run.show_all(0..CORRECTED_AT);
@@ -225,7 +225,7 @@ fn what_moves_takes_its_frames_along() {
     let moved_by = distance(&again, &last.world_from_camera);
     assert!(moved_by < 1e-9, "odometry's place of the camera moved by {moved_by}");
     assert_eq!(anchored.map_from_keyframe, bend(&active.map_from_keyframe));
-    // Its unit is the map's, which has not changed: the keyframe's, which has, is longer there too.
+    // Odometry's unit is the map's, which has not changed: the unit of the keyframe, which has, is longer there too.
     let unit =
         |keyframe: &Keyframe| keyframe.world_from_keyframe.scale / keyframe.map_from_keyframe.scale;
     assert!((unit(anchored) / unit(&active) - 1.0).abs() < 1e-12, "odometry's unit changes");
@@ -235,7 +235,7 @@ fn what_moves_takes_its_frames_along() {
     assert!(step < 0.05, "odometry jumps by {step}");
     let expected = run.mapper.map().place(next.keyframe_id, &next.keyframe_from_camera).unwrap();
     assert!(distance(&expected, &next.map_from_camera) < 1e-9, "the tracker has the new place");
-    // A keyframe that is made afterwards is where the corrected map says.
+    // A later keyframe is placed according to the corrected map.
     run.show_all(CORRECTED_AT + 1..FRAMES);
     let map = run.mapper.map();
     assert!(map.keyframes.len() > before.keyframes.len(), "no keyframe was made afterwards");
@@ -248,9 +248,9 @@ fn what_moves_takes_its_frames_along() {
     assert!(distance(&in_world, &pose.world_from_camera) < 1e-6, "odometry continues");
 }
 
-/// Depth by a plane on its logarithm: in the keyframe, in what continues to be observed, and in the file.
+/// Depth corrected by a plane on its logarithm: in the keyframe, in further observations, and in the file.
 #[test]
-fn depth_is_corrected_where_it_is_observed_too() {
+fn depth_is_corrected_for_further_observations_too() {
     let footage = &*FOOTAGE;
     let mut run = Run::new(footage);
     run.show_all(0..CORRECTED_AT);
@@ -274,7 +274,7 @@ fn depth_is_corrected_where_it_is_observed_too() {
         run.mapper.map().get(active).unwrap().revision > corrected.revision
     });
     assert!(published.is_some(), "its depth is never published again");
-    // The frames change depth by their own little, not back by the plane.
+    // The frames change depth by their own small amount, not back by the plane.
     let observed = run.mapper.map().get(active).unwrap();
     let mean = |points: &[semidense::slam::keyframe::DepthPoint]| {
         points.iter().map(|p| f64::from(p.inverse_depth)).sum::<f64>() / points.len() as f64
@@ -285,15 +285,15 @@ fn depth_is_corrected_where_it_is_observed_too() {
     let path = folder.path().join("map.bin");
     write_map(&path, run.mapper.map(), &mut || ()).unwrap();
     let read = read_map(&path).unwrap();
-    // What a keyframe is found by is not in the file: it is made again from the image.
+    // Descriptions are not in the file: they are computed again from the image.
     let mut written = run.mapper.map().keyframes.clone();
     written.iter_mut().for_each(|keyframe| keyframe.description = None);
     assert_eq!((read.revision, read.keyframes), (1, written));
 }
 
-/// A mapper that dies after a correction continues from the corrected map, and odometry where it was.
+/// A mapper that dies after a correction is succeeded from the corrected map, with odometry unchanged.
 #[test]
-fn a_successor_goes_on_from_the_corrected_map() {
+fn a_successor_continues_from_the_corrected_map() {
     let footage = &*FOOTAGE;
     let mut run = Run::new(footage);
     run.show_all(0..CORRECTED_AT);
@@ -311,7 +311,7 @@ fn a_successor_goes_on_from_the_corrected_map() {
     assert_eq!((resumed.map_revision, successor.map().revision), (1, 1));
 }
 
-/// An epoch that turns out to be a part of another goes over into it, with all its frames.
+/// An epoch that turns out to be part of another is joined to it, with all its frames.
 #[test]
 fn joined_epochs_are_one() {
     let footage = &*FOOTAGE;
@@ -319,7 +319,7 @@ fn joined_epochs_are_one() {
     run.show_all(0..CORRECTED_AT);
     let black = vec![0; footage.frames[0].len()];
     (0..80).for_each(|_| run.show(&black));
-    // The mirror image: a place that no keyframe knows.
+    // The mirror image: a place that no keyframe shows.
     let width = footage.intrinsics.width;
     for pixels in &footage.frames {
         let rows = pixels.chunks_exact(width);
@@ -338,7 +338,7 @@ fn joined_epochs_are_one() {
     assert!(moved_by < 1e-9, "odometry moved by {moved_by}");
     let last = *run.poses.last().unwrap();
     assert_eq!((last.epoch, last.state), (1, TrackingState::Tracking));
-    // The camera goes back the way it came.
+    // The camera retraces its path.
     for pixels in footage.frames.iter().rev().take(5) {
         let rows = pixels.chunks_exact(width);
         run.show(&rows.flat_map(|row| row.iter().rev().copied()).collect::<Vec<_>>());
@@ -350,7 +350,7 @@ fn joined_epochs_are_one() {
 }
 
 #[test]
-fn a_broken_correction_is_refused_as_a_whole() {
+fn an_invalid_correction_is_refused_as_a_whole() {
     let footage = &*FOOTAGE;
     let mut run = Run::new(footage);
     run.show_all(0..CORRECTED_AT);
@@ -376,7 +376,7 @@ fn a_broken_correction_is_refused_as_a_whole() {
         assert!(matches!(refused.unwrap_err(), CorrectionError::Unit), "{unit}");
     }
     assert_eq!((run.mapper.map().revision, &run.mapper.map().keyframes), (0, &before.keyframes));
-    // Of keyframes that are gone nothing is done.
+    // Corrections of unknown keyframes have no effect.
     let mut unknown = sane;
     unknown.keyframes.iter_mut().for_each(|corrected| corrected.keyframe_id += 1000);
     run.mapper.apply(&unknown).unwrap();

@@ -1,5 +1,5 @@
-//! The map as one surface against the true one, in a simulated room with exact depth: fewer points, fewer of them wrong,
-//! and nothing lost that was right.
+//! The map as one surface compared with the true one, in a simulated room with exact depth: fewer points, fewer wrong
+//! ones, and no loss of correct surface.
 
 use nalgebra::Vector3;
 use semidense::capture::simulator::Simulator;
@@ -17,10 +17,10 @@ use semidense::slam::trajectory::StampedPose;
 const FRAMES: usize = 120;
 
 #[test]
-fn the_surface_of_a_room_has_fewer_points_and_fewer_of_them_off() {
+fn the_surface_of_a_room_has_fewer_points_and_a_smaller_share_of_outliers() {
     let params = SimulatorParams { frames: FRAMES, ..SimulatorParams::half_size() };
     let mut source = Simulator::new(params).unwrap();
-    // The map is where the truth is, so that what is left is its depth's error.
+    // The map is at the true poses, so that only the error of its depth remains.
     let mut config = ReplayConfig { poses: PoseOrigin::GroundTruth, ..ReplayConfig::default() };
     config.tracker.alignment.simd = SimdMode::Portable;
     let record = replay(&mut source, "room", &config, &mut |_| true).unwrap();
@@ -30,7 +30,7 @@ fn the_surface_of_a_room_has_fewer_points_and_fewer_of_them_off() {
     };
     let k = source.intrinsics();
     let first = &record.map.keyframes[0];
-    // The map begins at its first keyframe.
+    // The map starts at its first keyframe.
     let at_first = Sim3::new(true_pose(first).world_from_camera, 1.0);
     let world_from_map = at_first * Sim3::new(first.map_from_keyframe.rigid, 1.0).inverse();
     let (mut truth, mut cameras, mut all) = (TrueSurface::default(), Vec::new(), Vec::new());
@@ -68,10 +68,10 @@ fn the_surface_of_a_room_has_fewer_points_and_fewer_of_them_off() {
         before.len(),
         after.len()
     );
-    // Six keyframes share less than the twenty of a whole run.
+    // Six keyframes overlap less than the twenty of a whole run.
     assert!(after.len() * 4 < before.len(), "{} of {}", after.len(), before.len());
     assert!(of_surface.median_ratio < 0.006 && of_surface.off < 0.05, "{of_surface:?}");
-    // What is right is seen many times, and what is wrong once: to be as good as all with one point a place is better.
+    // Correct points are seen many times, wrong ones once: the same share with one point per cell is better.
     assert!(of_surface.off < 1.2 * of_all.off, "{of_surface:?}, before {of_all:?}");
     assert!(shown > 0.97, "{shown}");
     let normals = surface.iter().filter(|point| point.normal != [0.0; 3]).count();

@@ -1,5 +1,5 @@
-//! Monte-Carlo: the error of a single observation of inverse depth against the standard deviation that
-//! it predicts of itself, in a simulated room with exact poses and depth and known noise on both.
+//! Monte Carlo: the error of a single observation of inverse depth compared with its own predicted standard deviation,
+//! in a simulated room with exact poses and depth and known noise on both.
 
 use nalgebra::Vector6;
 use semidense::capture::simulator::Simulator;
@@ -23,7 +23,7 @@ use semidense::slam::kernel::Portable;
 const FRAMES: usize = 19;
 const STRIDE: usize = 3;
 
-/// A keyframe with its depth, and frames with their exact motion.
+/// A keyframe with its depth, and frames with exact motion.
 struct Sequence {
     intrinsics: Intrinsics,
     map: DepthMap,
@@ -50,14 +50,14 @@ fn sequence(seed: u64, noise_std_dev: f64) -> Sequence {
     Sequence { intrinsics, map, depth, frames }
 }
 
-/// Errors of observations over their predicted standard deviation. The pose is turned by noise that moves
+/// Errors of observations relative to their predicted standard deviation. The pose is rotated by noise that displaces
 /// the image by `pose_noise_px` along each axis.
 fn normalized_errors(noise_std_dev: f64, pose_noise_px: f64) -> Vec<f64> {
-    /// Draws of the pose of each frame: its error is common to all pixels.
+    /// Random draws of the pose of each frame: its error is common to all pixels.
     const DRAWS: usize = 6;
-    /// Every so many rows and columns are observed.
+    /// Spacing of the observed rows and columns.
     const SPACING: usize = 6;
-    // A pixel is rounded: 1/√12 grey levels.
+    // Rounding of a pixel: 1/√12 grey levels.
     let pixel_std_dev = (noise_std_dev.powi(2) + 1.0 / 12.0).sqrt() as f32;
     let noise = ImageNoise { pixel_std_dev, ..ImageNoise::DEFAULT };
     let mut params = MatchingParams { noise, line_noise_px: 0.0, ..MatchingParams::default() };
@@ -89,7 +89,7 @@ fn normalized_errors(noise_std_dev: f64, pose_noise_px: f64) -> Vec<f64> {
     errors
 }
 
-/// Error over predicted standard deviation of one pixel; `None` where it is not observed.
+/// Error of one pixel relative to its predicted standard deviation; `None` if it is not observed.
 fn observe(
     map: &DepthMap,
     frame: &QuadImage,
@@ -98,7 +98,7 @@ fn observe(
     truth: f32,
     params: &MatchingParams,
 ) -> Option<f64> {
-    /// Shares of the true inverse depth that are searched: no false match far away.
+    /// Range of the search relative to the true inverse depth: no distant false matches.
     const SEARCHED: (f32, f32) = (0.85, 1.15);
     if !map.candidates.at(u, v) {
         return None;
@@ -107,7 +107,7 @@ fn observe(
     let at = line.project(truth)?;
     let conditioning = condition(view, &line, &at, &map.structure.at(u, v), 1.0, params)?;
     let (from, to) = (line.project(SEARCHED.0 * truth)?, line.project(SEARCHED.1 * truth)?);
-    // Where the search spans no pixel an error cannot show.
+    // If the search spans no pixel, an error cannot show.
     if (to.u - from.u).hypot(to.v - from.v) < 3.0 {
         return None;
     }
@@ -123,19 +123,19 @@ fn normal(stream: &mut Stream) -> f64 {
     (0..12).map(|_| f64::from(stream.uniform(-0.5, 0.5))).sum()
 }
 
-/// Standard deviation about zero that a normal distribution of the same median size has.
+/// Standard deviation about zero of a normal distribution with the same median magnitude.
 fn robust_std_dev(errors: &[f64]) -> f64 {
     let mut sizes: Vec<f64> = errors.iter().map(|e| e.abs()).collect();
     sizes.sort_by(f64::total_cmp);
     1.4826 * sizes[sizes.len() / 2]
 }
 
-/// What a robust standard deviation of normalised errors may be: outside, observations are believed
-/// twice too much or half too little.
+/// Accepted robust standard deviation of normalised errors: outside, observations would be over-weighted twofold or
+/// under-weighted by half.
 const HONEST: std::ops::RangeInclusive<f64> = 0.7..=1.4;
 
 #[test]
-fn observations_are_as_uncertain_as_they_say() {
+fn observations_are_as_uncertain_as_predicted() {
     for noise_std_dev in [0.0, 2.0, 4.0] {
         for pose_noise_px in [0.0, 0.3] {
             let errors = normalized_errors(noise_std_dev, pose_noise_px);

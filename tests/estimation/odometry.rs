@@ -1,4 +1,4 @@
-//! The library's odometry is the program's recipe: it gives the bits of a replay.
+//! The library's odometry is the program's recipe: it gives the same bits as a replay.
 
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::SimulatorParams;
@@ -20,7 +20,7 @@ fn source() -> Simulator {
 }
 
 #[test]
-fn poses_and_map_are_those_of_a_replay() {
+fn poses_and_map_equal_those_of_a_replay() {
     let record = replay(&mut source(), "sim", &ReplayConfig::default(), &mut |_| true).unwrap();
     let mut source = source();
     let camera = source.intrinsics();
@@ -53,7 +53,7 @@ fn poses_and_map_are_those_of_a_replay() {
 }
 
 #[test]
-fn frames_go_on_after_the_end() {
+fn frames_continue_after_the_end() {
     let mut source = source();
     let truth = source.ground_truth().to_vec();
     let camera = source.intrinsics();
@@ -91,7 +91,7 @@ fn frames_go_on_after_the_end() {
 }
 
 #[test]
-fn a_camera_that_is_none_and_a_frame_of_another_size_are_told() {
+fn an_invalid_camera_and_a_frame_of_another_size_are_reported() {
     let camera = Intrinsics { fx: f64::NAN, ..source().intrinsics() };
     let error = Odometry::new(camera, OdometryParams::default()).unwrap_err();
     assert!(matches!(error, OdometryError::Intrinsics(_)), "{error}");

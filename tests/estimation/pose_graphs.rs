@@ -1,4 +1,4 @@
-//! The pose graph's solver against the public graphs, where these are on the machine.
+//! The pose-graph solver on the public graphs, if these are on the machine.
 
 use std::time::Instant;
 
@@ -6,7 +6,7 @@ use crate::g2o;
 use crate::recording::{recording, say};
 use semidense::slam::graph::{GraphParams, optimise};
 
-/// Optimum of each graph as GTSAM 4.3.0 finds it: `tests/fixtures/pose-graphs/optimum.py`.
+/// Optimum of each graph according to GTSAM 4.3.0: `tests/fixtures/pose-graphs/optimum.py`.
 const OPTIMA: [(&str, f64); 4] = [
     ("parking-garage", 1.268385),
     ("sphere2500", 1351.401926),
@@ -14,11 +14,11 @@ const OPTIMA: [(&str, f64); 4] = [
     ("cubicle", 2745.552078),
 ];
 
-/// Share of the optimum by which the result may differ.
+/// Relative difference by which the result may deviate from the optimum.
 const TOLERANCE: f64 = 1e-3;
 
 #[test]
-fn the_optimum_is_that_of_an_independent_solver() {
+fn the_optimum_equals_that_of_an_independent_solver() {
     let Some(folder) = recording("pose-graphs") else { return };
     for (name, optimum) in OPTIMA {
         let mut graph = g2o::read(&folder.join(format!("{name}.g2o")));

@@ -1,5 +1,5 @@
-//! Monte-Carlo: hypotheses with known noise through an exact motion; the variance that propagation
-//! predicts against the scatter of what arrives.
+//! Monte Carlo: hypotheses with known noise propagated by an exact motion; the predicted variance compared with the
+//! scatter of the results.
 
 use nalgebra::Vector6;
 use semidense::slam::depth::map::{DepthMap, Hypothesis};
@@ -10,13 +10,13 @@ use semidense::slam::pose::Brightness;
 
 const CAMERA: Intrinsics = Intrinsics::pinhole(192, 144, 130.0);
 
-/// Pixels between two hypotheses: none meets another after the motion.
+/// Pixels between two hypotheses: none collide after the motion.
 const SPACING: usize = 12;
 /// σ of the inverse depth over the inverse depth.
 const RELATIVE_STD_DEV: f64 = 0.03;
 const TRIALS: usize = 1000;
 
-/// SplitMix64, summed to a normal.
+/// SplitMix64, summed to a normal distribution.
 struct Noise(u64);
 
 impl Noise {
@@ -32,8 +32,8 @@ impl Noise {
     }
 }
 
-/// Every pixel with a hypothesis: where, its inverse depth, and what the motion makes of it: pixel and
-/// inverse depth in the target.
+/// A pixel with a hypothesis: position and inverse depth, and the pixel and inverse depth in the target after the
+/// motion.
 struct Carried {
     at: (usize, usize),
     inverse_depth: f64,
@@ -64,14 +64,14 @@ fn carried(target_from_source: &SE3) -> Vec<Carried> {
     carried
 }
 
-/// Maps without texture whose every pixel may carry depth.
+/// A map without texture in which every pixel may have depth.
 fn blank() -> DepthMap {
     let mut map = DepthMap::with_size(CAMERA.width, CAMERA.height);
     map.candidates.pixels_mut().fill(true);
     map
 }
 
-/// The hypothesis nearest to a pixel: noise in the depth moves where it arrives.
+/// The hypothesis nearest to a pixel: noise in the depth shifts its target.
 fn arrived(map: &DepthMap, (u, v): (usize, usize)) -> Option<Hypothesis> {
     const REACH: usize = 5;
     let around = (v - REACH..=v + REACH).flat_map(|y| (u - REACH..=u + REACH).map(move |x| (x, y)));
@@ -80,7 +80,7 @@ fn arrived(map: &DepthMap, (u, v): (usize, usize)) -> Option<Hypothesis> {
     nearest.map(|(x, y)| map.hypotheses.at(x, y))
 }
 
-/// Root mean square over trials of error over predicted standard deviation, for each pixel.
+/// For each pixel, the root mean square over all trials of error relative to predicted standard deviation.
 fn normalized_spreads(target_from_source: &SE3) -> Vec<f64> {
     let params = PropagationParams { process_noise_ratio: 0.0, ..PropagationParams::default() };
     let carried = carried(target_from_source);
@@ -114,7 +114,7 @@ fn normalized_spreads(target_from_source: &SE3) -> Vec<f64> {
 }
 
 #[test]
-fn propagated_variance_is_the_scatter_of_what_arrives() {
+fn propagated_variance_matches_the_scatter_of_the_results() {
     for (name, twist) in [
         ("along z, nearer", [0.0, 0.0, -0.35, 0.0, 0.0, 0.0]),
         ("along z, farther", [0.0, 0.0, 0.5, 0.0, 0.0, 0.0]),
@@ -129,7 +129,7 @@ fn propagated_variance_is_the_scatter_of_what_arrives() {
         let mean = spreads.iter().sum::<f64>() / spreads.len() as f64;
         let worst = spreads.iter().map(|spread| (spread - 1.0).abs()).fold(0.0, f64::max);
         println!("{name}: mean {mean:.4}, farthest from 1 by {worst:.4}, {} pixels", spreads.len());
-        // To first order in noise of 3 %. A pixel's spread over so many trials scatters by 0.022.
+        // To first order in a noise of 3 %. A pixel's spread over so many trials scatters by 0.022.
         assert!((mean - 1.0).abs() < 0.01 && worst < 0.1, "{name}: mean {mean}, worst {worst}");
     }
 }

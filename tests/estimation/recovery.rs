@@ -1,5 +1,5 @@
-//! Loss and recovery over the whole recipe: a blackout before a known view and before a new one, a
-//! standing camera, and maps that contradict themselves: by their poses, and from the start.
+//! Loss and recovery with the whole pipeline: a blackout before a known view and before a new one, a standing camera,
+//! and inconsistent maps: by their poses, and from the start.
 
 use crate::recording::recording;
 use nalgebra::Vector6;
@@ -28,10 +28,10 @@ use semidense::slam::mapper::{Mapper, MapperParams};
 use semidense::slam::pose::{NO_KEYFRAME, PoseEstimate, TrackingState};
 use semidense::slam::trajectory::StampedPose;
 
-/// Time from frame to frame.
+/// Time between frames.
 const PERIOD_NANOS: i64 = 33_333_333;
 
-/// Frames in an order of our own, at a steady rate.
+/// Frames in a chosen order, at a steady rate.
 struct Script {
     intrinsics: Intrinsics,
     frames: Vec<Vec<u8>>,
@@ -152,7 +152,7 @@ fn error_of(record: &RunRecord, epoch: u32) -> TrajectoryEvaluation {
 }
 
 #[test]
-fn after_a_blackout_a_known_view_is_found_again() {
+fn after_a_blackout_the_camera_is_relocalised_in_a_known_view() {
     let room = footage(1, MotionKind::Handheld, 140, 2.0);
     let replay = |recovery: RecoveryParams| {
         let mut script = Script::new(room.intrinsics);
@@ -172,7 +172,7 @@ fn after_a_blackout_a_known_view_is_found_again() {
     assert!(estimates(&record).all(|e| e.epoch == 0), "it is the same map");
     let ratio = error_ratio(&record, 0);
     assert!(ratio < 0.02, "{ratio}");
-    // In the map it is back where it was; odometry continues from where it was lost.
+    // In the map it is back at the earlier pose; odometry continues from where it was lost.
     let tracked: Vec<_> = estimates(&record).filter(|e| e.state.is_tracked()).collect();
     let found = tracked.iter().position(|e| e.sequence >= 160).unwrap();
     let (last, first) = (tracked[found - 1], tracked[found]);
@@ -188,7 +188,7 @@ fn after_a_blackout_a_known_view_is_found_again() {
 }
 
 #[test]
-fn after_a_blackout_a_new_view_begins_a_new_epoch() {
+fn after_a_blackout_a_new_view_starts_a_new_epoch() {
     let room = footage(1, MotionKind::Handheld, 80, 2.0);
     let elsewhere = footage(7, MotionKind::Handheld, 170, 2.0);
     let mut script = Script::new(room.intrinsics);
@@ -207,14 +207,14 @@ fn after_a_blackout_a_new_view_begins_a_new_epoch() {
     assert!(error_ratio(&record, 1) < 0.03);
     let epochs: Vec<u32> = record.map.keyframes.iter().map(|k| k.epoch).collect();
     assert!(epochs.is_sorted() && epochs[0] == 0, "earlier epochs stay: {epochs:?}");
-    // The new epoch begins near where the camera was last known to be.
+    // The new epoch starts near the last known pose of the camera.
     let last = estimates(&record).rfind(|e| e.epoch == 0 && e.state.is_tracked()).unwrap();
     let first = record.map.keyframes.iter().find(|k| k.epoch == 1).unwrap();
     assert_eq!(first.map_from_keyframe.rigid, last.world_from_camera);
 }
 
 #[test]
-fn back_at_a_place_of_an_earlier_epoch_the_camera_is_found_there() {
+fn back_at_a_place_of_an_earlier_epoch_the_camera_is_relocalised_there() {
     let room = footage(1, MotionKind::Handheld, 100, 2.0);
     let elsewhere = footage(7, MotionKind::Handheld, 170, 2.0);
     let mut script = Script::new(room.intrinsics);
@@ -241,8 +241,8 @@ fn back_at_a_place_of_an_earlier_epoch_the_camera_is_found_there() {
 }
 
 #[test]
-fn a_camera_that_comes_back_elsewhere_is_not_claimed_where_it_is_not() {
-    // Frames that are seen before, between and after two blackouts, during which the camera moves on.
+fn a_camera_that_returns_elsewhere_is_not_relocalised_at_a_wrong_place() {
+    // Frames seen before, between and after two blackouts, during which the camera moves on.
     for (name, most_m, seen) in [
         ("redkitchen", 0.08, [0..175, 224..350, 399..500]),
         ("redkitchen", 0.08, [20..188, 235..356, 403..500]),
@@ -259,14 +259,14 @@ fn a_camera_that_comes_back_elsewhere_is_not_claimed_where_it_is_not() {
         let record = script.replay(&ReplayConfig::default());
         let tracked = estimates(&record).filter(|e| e.state.is_tracked()).count();
         println!("{name}: {tracked} of {} tracked", record.poses.len());
-        // A wrong place after a blackout is 0.7 m off, and 0.1 m in the other room.
+        // A wrong place after a blackout would be 0.7 m off, and 0.1 m in the other room.
         let error = error_of(&record, 0).ate.rmse;
         assert!(error < most_m, "{name}: {error} m");
     }
 }
 
 #[test]
-fn frames_from_before_the_map_began_have_a_pose_in_the_end() {
+fn frames_from_before_the_start_of_the_map_have_a_pose_in_the_end() {
     let room = footage(1, MotionKind::Handheld, 100, 2.0);
     let mut script = Script::new(room.intrinsics);
     script.show(&room, 0..100);
@@ -307,7 +307,7 @@ fn a_standing_camera_never_initialises() {
 }
 
 #[test]
-fn a_camera_that_comes_to_rest_stays_where_it_is() {
+fn a_camera_that_comes_to_rest_does_not_drift() {
     const REST: usize = 70;
     let room = footage(3, MotionKind::Handheld, REST, 0.0);
     let mut script = Script::new(room.intrinsics);
@@ -315,19 +315,19 @@ fn a_camera_that_comes_to_rest_stays_where_it_is() {
     script.show(&room, std::iter::repeat_n(REST - 1, 150));
     let mut random = 1u64;
     for pixel in script.frames.iter_mut().flatten() {
-        // A sum of four uniform bytes is near enough to a Gaussian: σ = 148 / 49 = 3 grey levels.
+        // A sum of four uniform bytes is close enough to a Gaussian: σ = 148 / 49 = 3 grey levels.
         random =
             random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         let sum: i32 = (random >> 32).to_le_bytes()[..4].iter().map(|&b| i32::from(b)).sum();
         *pixel = (i32::from(*pixel) + (sum - 510) / 49).clamp(0, 255) as u8;
     }
     let record = script.replay(&ReplayConfig::default());
-    // The first frames of rest are the end of the motion: refined depth moves the pose a little.
+    // The first frames at rest belong to the end of the motion: refined depth moves the pose a little.
     let resting: Vec<_> = estimates(&record).skip(REST + 20).collect();
     assert!(resting.iter().all(|e| e.state == TrackingState::Tracking));
     let last = record.map.keyframes.last().unwrap();
     assert!(last.sequence < REST as u64 + 5, "no keyframe is made at rest: {}", last.sequence);
-    // In shares of the mean depth: a few millimetres in a room of a few metres.
+    // Relative to the mean depth: a few millimetres in a room of a few metres.
     let unit = last.map_from_keyframe.scale;
     let first = resting[0].world_from_camera.translation;
     let furthest = resting
@@ -339,7 +339,7 @@ fn a_camera_that_comes_to_rest_stays_where_it_is() {
 }
 
 #[test]
-fn a_map_whose_poses_are_wrong_is_rejected() {
+fn a_map_with_wrong_poses_is_rejected() {
     const WRONG: usize = 50;
     let room = footage(1, MotionKind::Handheld, WRONG + 10, 2.0);
     let mut mapper = Mapper::new(room.intrinsics, MapperParams::default()).unwrap();
@@ -347,7 +347,7 @@ fn a_map_whose_poses_are_wrong_is_rejected() {
     for (index, pixels) in room.frames.iter().enumerate() {
         let frame =
             FrameView::new(&room.intrinsics, index as u64, index as i64 * PERIOD_NANOS, pixels);
-        // Three degrees are thirteen pixels.
+        // Three degrees correspond to thirteen pixels.
         let rotation = if index < WRONG { 0.0 } else { 3_f64.to_radians() };
         let wrong = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, rotation, 0.0, rotation));
         let world_from_camera = room.poses[0].inverse() * room.poses[index] * wrong;
@@ -379,18 +379,18 @@ fn a_map_whose_poses_are_wrong_is_rejected() {
 }
 
 #[test]
-fn a_start_with_the_wrong_motion_is_rejected_and_another_begun() {
+fn a_start_with_the_wrong_motion_is_rejected_and_a_new_one_begun() {
     // A plane seen from two places has two explanations, and here the wrong one fits better.
     wrong_start(6, 40);
     wrong_start(10, 40);
 }
 
 #[test]
-fn a_start_with_the_wrong_motion_that_the_joint_estimate_bends_until_it_fits_is_rejected() {
+fn a_start_with_the_wrong_motion_is_rejected_even_if_the_joint_estimate_makes_it_fit() {
     wrong_start(3, 50);
 }
 
-/// A start on the floor from a frame on, with the wrong one of its motions, is rejected within so many frames.
+/// Checks that a start on the floor from `first_frame` with the wrong of two motions is rejected within `most_frames`.
 fn wrong_start(first_frame: usize, most_frames: u64) {
     let Some(folder) = recording("fr1-floor") else { return };
     let mut source = open(&SourceName::Tum(folder), None, &SourceParams::default()).unwrap();
@@ -410,13 +410,13 @@ fn wrong_start(first_frame: usize, most_frames: u64) {
         let first = claimed.next().unwrap().sequence;
         (first, claimed.next_back().unwrap().sequence)
     });
-    // By its first keyframes; the next at once, and not after the seconds for which a lost camera is looked for.
+    // Judged by its first keyframes; the next start follows at once, not after the seconds spent on relocalising.
     assert!(first.1 - first.0 < most_frames && second.0 - first.1 < 15, "{first:?} {second:?}");
     let (wrong, right) = (error_ratio(&record, 0), error_ratio(&record, 1));
     assert!(right < 0.01 && wrong > 2.0 * right, "{wrong} {right}");
 }
 
-/// A camera that loses itself, begins an epoch elsewhere and comes back to the first place: the frame at which it is back
+/// A camera that is lost, starts an epoch elsewhere and returns to the first place: the frame at which it is back
 /// there, and the run.
 fn separated_and_back(num_candidates: usize) -> (usize, RunRecord) {
     let motion = MotionParams { mean_turn_deg_s: 18.0, ..MotionParams::default() };
@@ -435,7 +435,7 @@ fn separated_and_back(num_candidates: usize) -> (usize, RunRecord) {
 }
 
 #[test]
-fn an_epoch_that_sees_a_place_of_the_one_before_it_becomes_part_of_it() {
+fn an_epoch_that_sees_a_place_of_an_earlier_one_is_joined_to_it() {
     let (back, record) = separated_and_back(MapperParams::default().loops.num_candidates);
     assert!(estimates(&record).any(|e| e.epoch == 1 && e.state.is_tracked()), "none was begun");
     let searches = record.searches.as_deref().unwrap_or_default();
@@ -449,7 +449,7 @@ fn an_epoch_that_sees_a_place_of_the_one_before_it_becomes_part_of_it() {
     assert!(record.map.keyframes.iter().all(|k| k.epoch == 0), "the older numbering stays");
     let after: Vec<_> = estimates(&record).filter(|e| e.sequence > joins[0] + 20).collect();
     assert!(after.iter().all(|e| e.epoch == 0));
-    // Frames of both lie in one map now, odometry has not moved.
+    // Frames of both are in one map now; odometry has not moved.
     let placed = |e: &PoseEstimate| {
         let world_from_camera = record.map.place(e.keyframe_id, &e.keyframe_from_camera)?;
         Some(StampedPose { nanos: e.capture_nanos, world_from_camera })
@@ -469,7 +469,7 @@ fn an_epoch_that_sees_a_place_of_the_one_before_it_becomes_part_of_it() {
     let mut steps: Vec<f64> = steps.take(20).collect();
     steps.sort_by(f64::total_cmp);
     assert!(steps[19] < 4.0 * steps[10], "odometry jumps: {steps:?}");
-    // Without the search it stays apart.
+    // Without the search it stays separate.
     let (_, alone) = separated_and_back(0);
     assert!(alone.map.keyframes.iter().any(|k| k.epoch == 1));
 }

@@ -1,5 +1,5 @@
-//! The two-frame start on simulated sequences: it starts where there is parallax, with the right pose
-//! and depth, and never where there is none.
+//! The two-frame start on simulated sequences: it starts where there is parallax, with the correct pose and depth, and
+//! never without parallax.
 
 use crate::recording::{recording, say};
 use semidense::capture::opening::{SourceParams, open};
@@ -17,14 +17,14 @@ use semidense::slam::image::buffer::Image;
 use semidense::slam::two_frame::evidence::EvidenceParams;
 use semidense::slam::two_frame::{InitState, TwoFrameInitializer, TwoFrameParams};
 
-/// Largest error of the direction of a start that is proven by earlier frames and not by a long
-/// translation, degrees: it is of some 2 px, and its map is corrected by the frames that follow.
+/// Largest direction error of a start that is proven by earlier frames and not by a long translation, degrees: it
+/// corresponds to about 2 px, and the following frames correct the map.
 const EARLY_DIRECTION_DEG: f64 = 20.0;
 
-/// What a start came to.
+/// Outcome of a start.
 #[derive(Debug)]
 struct Start {
-    /// Frames from the first one of all to the proof, failed starts included.
+    /// Frames from the very first one to the proof, including failed starts.
     frames: usize,
     /// Length of the translation in mean depths.
     translation: f64,
@@ -32,7 +32,7 @@ struct Start {
 }
 
 impl Start {
-    /// Median relative error of its depths, where the truth is known.
+    /// Median relative error of its depths, if the truth is known.
     fn depth_error(&self) -> Option<f64> {
         self.errors.depth.map(|depth| depth.relative_error_median)
     }
@@ -105,7 +105,7 @@ fn params(kind: MotionKind, seed: u64, frames: usize, noise_std_dev: f64) -> Sim
 }
 
 #[test]
-fn a_hand_held_camera_starts() {
+fn a_handheld_camera_starts() {
     for seed in 1..=5 {
         let start = simulated(params(MotionKind::Handheld, seed, 60, 2.0)).unwrap();
         println!("handheld {seed}: {start:.3?}");
@@ -126,24 +126,24 @@ fn a_camera_on_a_rail_starts_in_every_scene() {
 }
 
 #[test]
-fn a_turning_camera_never_starts() {
+fn a_rotating_camera_never_starts() {
     for seed in 1..=3 {
         let start = simulated(params(MotionKind::Rotation, seed, 100, 2.0));
         assert!(start.is_none(), "{seed}: {start:?}");
     }
 }
 
-/// The error of the direction that is allowed: what is asked of a start with enough translation.
+/// The allowed direction error: that required of a start with enough translation.
 fn allowed_deg(start: &Start, direction_deg: f64) -> f64 {
     let is_early = start.translation < EvidenceParams::default().min_translation;
     if is_early { direction_deg.max(EARLY_DIRECTION_DEG) } else { direction_deg }
 }
 
-/// Frames of a source within which a start must be proven.
+/// Number of frames within which a start must be proven.
 const PATIENCE: usize = 60;
 
-/// Starts of a recording after so many frames, with the largest error of direction and depth that the
-/// ground truth lets us ask for: `truth_error_m` across a baseline of some centimetres turns its direction.
+/// Starts of a recording after each of `skips` frames, with the largest direction and depth errors that the accuracy
+/// of the ground truth permits: `truth_error_m` across a baseline of some centimetres rotates its direction.
 fn assert_recording_starts(
     name: &str,
     skips: &[usize],
@@ -163,7 +163,7 @@ fn assert_recording_starts(
             start.errors.direction_deg <= allowed_deg(&start, direction_deg) + truth_deg,
             "{name} from {skip}: {start:?}"
         );
-        // Where the first frame has no depth there is nothing to compare.
+        // If the first frame has no depth there is nothing to compare.
         assert!(
             !start.depth_error().is_some_and(|error| error > depth),
             "{name} from {skip}: {start:?}"
@@ -173,14 +173,14 @@ fn assert_recording_starts(
 
 #[test]
 fn the_recording_of_a_kitchen_starts() {
-    // Depth fusion places the camera within some millimetres: over the first 10 frames it moves it by 9 mm, and
-    // tracking against the depth camera says 10 mm in a direction 37° off.
+    // Depth fusion is accurate to some millimetres: over the first 10 frames it moves the camera by 9 mm, whereas
+    // tracking on the depth camera gives 10 mm in a direction 37° away.
     assert_recording_starts("redkitchen", &[0, 152, 300], 10.0, 0.15, 0.006);
 }
 
 #[test]
 fn the_recording_of_a_floor_starts() {
-    // From the 12th frame on a plane seen from two places has two explanations.
+    // From the 12th frame on: a plane seen from two places has two explanations.
     assert_recording_starts("fr1-floor", &[0, 12, 20, 40], 10.0, 0.1, 0.0);
 }
 
@@ -194,12 +194,12 @@ fn the_rendered_desk_starts() {
     assert_recording_starts("tsukuba", &[0, 40, 80], 5.0, 0.1, 0.0);
 }
 
-/// First frames of a recording that are tried, and how far they are apart.
+/// Number of first frames that are tried, and their distance.
 const FIRST_FRAMES: usize = 12;
 const APART: usize = 3;
 
-/// Starts a recording from each of its first frames with every `stride`-th frame, prints what each came to, and
-/// gives how many started and how many of them were wrong.
+/// Starts a recording from each of its first frames with every `stride`-th frame, prints each outcome, and returns how
+/// many started and how many of these were wrong.
 fn starts(name: &str, stride: usize) -> Option<(usize, usize)> {
     let folder = recording(name)?;
     let mut source = open(&SourceName::Tum(folder), None, &SourceParams::default()).unwrap();

@@ -1,5 +1,5 @@
-//! The unit of the world is nobody's business: the simulated room a tenth and ten times as large gives
-//! the same trajectory and the same depth up to that factor, in every way to start and to be given poses.
+//! Results do not depend on the unit of the world: the simulated room a tenth and ten times as large gives the same
+//! trajectory and the same depth up to that factor, for every kind of start and for given poses.
 
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::SimulatorParams;
@@ -8,9 +8,9 @@ use semidense::service::results::record::RunRecord;
 use semidense::slam::mapper::MapperParams;
 use semidense::slam::window::params::WindowParams;
 
-/// Share of the path by which trajectories may differ where a sensor's metres enter as f32.
+/// Relative deviation of trajectories, by length of path, where a sensor's metres enter as f32.
 const TOLERANCE: f64 = 1e-3;
-/// The same where keyframes are estimated jointly: for that rounding an iteration may end a step earlier or later. 2.0e-3
+/// The same where keyframes are estimated jointly: that rounding may end an iteration a step earlier or later. 2.0e-3
 /// was measured.
 const JOINT_TOLERANCE: f64 = 3e-3;
 
@@ -38,14 +38,14 @@ fn record_with(
     replay(&mut source, "sim", &config, &mut |_| true).unwrap()
 }
 
-/// Positions of the claimed poses, with the frame's number.
+/// Positions of the claimed poses, with the number of the frame.
 fn positions(record: &RunRecord) -> Vec<(u64, nalgebra::Vector3<f64>)> {
     let poses = record.poses.iter().map(|pose| pose.estimate);
     let tracked = poses.filter(|pose| pose.state.is_tracked());
     tracked.map(|pose| (pose.sequence, pose.world_from_camera.translation)).collect()
 }
 
-/// Median over the points of all keyframes of depth in world units.
+/// Median depth over the points of all keyframes, world units.
 fn median_depth(record: &RunRecord) -> f64 {
     let of_keyframe = record.map.keyframes.iter().flat_map(|keyframe| {
         let scale = keyframe.map_from_keyframe.scale;
@@ -56,7 +56,7 @@ fn median_depth(record: &RunRecord) -> f64 {
     depths[depths.len() / 2]
 }
 
-/// Compares the room of `scale` with the room as it is; `unit`: what its lengths are multiplied by.
+/// Compares the room of another scale with the original; `unit` is the factor on its lengths.
 fn assert_same(name: &str, one: &RunRecord, other: &RunRecord, unit: f64) {
     assert_same_within(TOLERANCE, name, one, other, unit);
 }
@@ -92,19 +92,19 @@ fn assert_same_within(tolerance: f64, name: &str, one: &RunRecord, other: &RunRe
 }
 
 #[test]
-fn from_images_alone_not_a_bit_changes() {
+fn poses_from_images_alone_are_bit_identical() {
     let (poses, depth) = (PoseOrigin::Tracker, DepthOrigin::Images);
     let one = record(1.0, poses, depth);
     for scale in [0.1, 10.0] {
         let other = record(scale, poses, depth);
-        // The unit of a map from images is its own.
+        // A map from images has its own unit.
         assert_same(&format!("images, {scale}"), &one, &other, 1.0);
         assert_eq!(positions(&one), positions(&other), "{scale}");
     }
 }
 
 #[test]
-fn with_depth_of_a_sensor_everything_is_in_its_unit() {
+fn with_sensor_depth_everything_has_the_unit_of_the_sensor() {
     let (poses, depth) = (PoseOrigin::Tracker, DepthOrigin::Sensor);
     let alone = WindowParams { num_free: 0, ..WindowParams::default() };
     for (window, tolerance) in [(alone, TOLERANCE), (WindowParams::default(), JOINT_TOLERANCE)] {
@@ -118,7 +118,7 @@ fn with_depth_of_a_sensor_everything_is_in_its_unit() {
 }
 
 #[test]
-fn with_given_poses_depth_is_in_their_unit() {
+fn with_given_poses_depth_has_their_unit() {
     for depth in [DepthOrigin::Sensor, DepthOrigin::Images] {
         let one = record(1.0, PoseOrigin::GroundTruth, depth);
         for scale in [0.1, 10.0] {

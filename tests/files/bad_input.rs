@@ -1,5 +1,5 @@
-//! Every bad input that we can think of: what is tried, what is said and the exit code. Nothing panics, nothing
-//! hangs, nothing is left behind; `docs/bad-inputs.md` is what this test saw.
+//! Every bad input that we can think of: the attempt, the message and the exit code. Nothing panics, nothing hangs,
+//! nothing is left behind; `docs/bad-inputs.md` lists what this test observed.
 
 mod table;
 
@@ -11,14 +11,14 @@ use crate::rendered::rendered;
 use crate::support::{Ended, Rig, finish};
 use table::{Row, SECTIONS};
 
-/// Frames of the recording that is broken.
+/// Frames of the recording that is damaged.
 const FRAMES: usize = 20;
 
-/// Set it to write the page anew: `SEMIDENSE_WRITE_DOCS=1 cargo test --release --test files bad_input`.
+/// If set, the page is regenerated: `SEMIDENSE_WRITE_DOCS=1 cargo test --release --test files bad_input`.
 const WRITE_VARIABLE: &str = "SEMIDENSE_WRITE_DOCS";
 
-/// What rows may call besides the programs of the system. Each starts in a folder with a recording of twenty frames
-/// (`recording`, TUM layout, 160x120) and a rig for it (`rig.toml`).
+/// Functions that rows may call besides the system's programs. Each row starts in a folder with a recording of twenty
+/// frames (`recording`, TUM layout, 160x120) and its rig (`rig.toml`).
 const PRELUDE: &str = r#"
 image() { ls recording/rgb/*.png | sed -n "$1p"; }
 change() { sed -i "$2" "$1"; }
@@ -35,9 +35,9 @@ halve() { truncate -s $(($(stat -c %s "$1") / 2)) "$1"; }
 const RIG: &str =
     "model = \"pinhole\"\nwidth = 160\nheight = 120\nfx = 131\nfy = 131\ncx = 79.5\ncy = 59.5\n";
 
-/// A shell in the folder of `rig` whose `semidense` is the real one.
+/// A shell in the folder of `rig` in which `semidense` is the real binary.
 fn shell(rig: &Rig, script: &str) -> Command {
-    // By its name on the path, so that programs like `timeout` find it too.
+    // Found by name on the path, so that programs like `timeout` find it too.
     let programs = rig.folder().join("bin");
     if fs::create_dir(&programs).is_ok() {
         let binary = env!("CARGO_BIN_EXE_semidense");
@@ -59,8 +59,8 @@ fn shell(rig: &Rig, script: &str) -> Command {
     command
 }
 
-/// What is said, as the page has it: the error with the command or tip below it, else the first warning, and the last
-/// line of the result where that tells of images that were left out. What differs from machine to machine is replaced.
+/// The message in the form of the page: the error with the command or tip below it, else the first warning, and the
+/// last line of the result if that reports skipped images. Machine-dependent parts are replaced.
 fn said(ended: &Ended, rig: &Rig) -> String {
     let find = |start: &str| ended.stderr.lines().find(|line| line.contains(start));
     let below = ended.stderr.lines().skip_while(|line| !line.starts_with("error: ")).skip(1);
@@ -86,7 +86,7 @@ fn said(ended: &Ended, rig: &Rig) -> String {
     text.trim_end().to_owned()
 }
 
-/// Runs a row; its line of the page, or what is wrong with what was said.
+/// Runs a row; returns its line of the page, or what is wrong with the message.
 fn observe(row: &Row, template: &Path) -> Result<String, String> {
     let rig = Rig::new();
     let copied = Command::new("cp").arg("-r").arg(template).arg(rig.folder()).status();
@@ -110,17 +110,17 @@ fn observe(row: &Row, template: &Path) -> Result<String, String> {
             row.tried, row.command, made.stderr, ended.stdout
         ));
     }
-    // What a table of Markdown would read as something else.
+    // Escapes what a Markdown table would interpret.
     let cell = |text: &str| text.replace('|', "\\|").replace('*', "\\*");
     let command = row.command.replace('|', "\\|");
     Ok(format!("| {} | `{command}` | {} | {} |\n", cell(row.tried), cell(&said), row.code))
 }
 
 #[test]
-fn every_bad_input_has_its_line_and_its_exit_code() {
+fn every_bad_input_has_its_line_and_exit_code() {
     let rig = Rig::new();
     let template = rendered(&rig, FRAMES);
-    // Mostly they wait for processes to start: the sections go side by side.
+    // They mostly wait for processes to start: run the sections in parallel.
     let seen: Vec<Vec<Result<String, String>>> = std::thread::scope(|scope| {
         let observe_all = |section: &'static table::Section| {
             let template = &template;
@@ -133,7 +133,7 @@ fn every_bad_input_has_its_line_and_its_exit_code() {
     let (mut rows, mut faults) = (0, Vec::new());
     for (section, seen) in SECTIONS.iter().zip(seen) {
         page += &format!(
-            "\n## {}\n\n| tried | command | said | exit |\n|---|---|---|---|\n",
+            "\n## {}\n\n| input | command | message | exit |\n|---|---|---|---|\n",
             section.title
         );
         for row in seen {
@@ -160,7 +160,7 @@ fn every_bad_input_has_its_line_and_its_exit_code() {
     assert_eq!(page.lines().count(), written.lines().count(), "write it with {WRITE_VARIABLE}=1");
 }
 
-/// Exit code 1 and exactly one error, with these words.
+/// Checks for exit code 1 and exactly one error, with these words.
 fn assert_refused(ended: &Ended, words: &[&str], what: &str) {
     assert_eq!(ended.status.code(), Some(1), "{what}: {}", ended.stderr);
     assert!(!ended.stderr.contains("panicked"), "{what}: {}", ended.stderr);
@@ -172,7 +172,7 @@ fn assert_refused(ended: &Ended, words: &[&str], what: &str) {
 }
 
 #[test]
-fn paths_of_any_bytes_are_accepted() {
+fn paths_of_arbitrary_bytes_are_accepted() {
     let rig = Rig::new();
     let folder = rendered(&rig, FRAMES);
     let odd = r"$(printf 'b\xffd $x')";
@@ -191,8 +191,8 @@ fn paths_of_any_bytes_are_accepted() {
     assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
 
-/// The binary in a shell whose children may write files of a few kilobytes at most: to a program a
-/// full disk looks much the same.
+/// The binary in a shell whose children may write files of at most a few kilobytes: to a program this looks much like
+/// a full disk.
 fn with_small_files(rig: &Rig, arguments: &str) -> Command {
     let mut command = Command::new("sh");
     command
@@ -209,7 +209,7 @@ fn with_small_files(rig: &Rig, arguments: &str) -> Command {
 }
 
 #[test]
-fn results_that_do_not_fit_are_one_line_and_no_half_file() {
+fn results_that_do_not_fit_give_one_line_and_no_partial_file() {
     let rig = Rig::new();
     let output = rig.output();
     let arguments = format!("replay sim --frames 2 --output '{}'", output.display());
@@ -219,12 +219,12 @@ fn results_that_do_not_fit_are_one_line_and_no_half_file() {
         .unwrap()
         .map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned())
         .collect();
-    // The run is not lost: its journal is all that there is.
+    // The run is not lost: only its journal is left.
     assert!(names.len() == 1 && names[0].starts_with(".semidense-journal"), "{names:?}");
 }
 
 #[test]
-fn a_full_standard_output_is_an_error_and_a_reader_that_leaves_is_none() {
+fn a_full_standard_output_is_an_error_and_a_closed_pipe_is_not() {
     let rig = Rig::new();
     let folder = rendered(&rig, FRAMES);
     let truth = folder.join("groundtruth.txt");

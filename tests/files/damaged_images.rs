@@ -1,5 +1,5 @@
-//! A recording with images that cannot be used: they are left out, counted and named; all that is
-//! good is tracked, in one process and in three the same.
+//! A recording with unusable images: they are skipped, counted and reported; all valid ones are tracked, with the same
+//! result in one process and in three.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -32,7 +32,7 @@ fn give_other_size(path: &Path) {
     fs::write(path, bytes).unwrap();
 }
 
-/// Breaks one image in each way that there is; the frames that are lost.
+/// Damages images in every possible way; returns the frames that are lost.
 fn break_some(folder: &Path) -> [usize; 7] {
     cut(&image(folder, 0));
     fs::remove_file(image(folder, 5)).unwrap();
@@ -59,7 +59,7 @@ fn summary(output: &Path) -> Value {
 }
 
 #[test]
-fn damaged_images_are_left_out_and_the_rest_is_tracked_alike() {
+fn damaged_images_are_skipped_and_the_rest_is_tracked_identically() {
     let rig = Rig::new();
     let folder = rendered(&rig, FRAMES);
     let lost = break_some(&folder);
@@ -68,7 +68,7 @@ fn damaged_images_are_left_out_and_the_rest_is_tracked_alike() {
         [(&["replay"][..], "replay"), (&["run"], "lockstep"), (&["run", "--live"], "live")]
     {
         let (ended, output) = play(&rig, arguments, &folder, name);
-        // A busy machine may have no time for a start live.
+        // Live, a busy machine may have no time for a start.
         let has_started = ended.status.code() != Some(NOTHING_TRACKED);
         assert!(ended.status.success() || name == "live" && !has_started, "{}", ended.stderr);
         let summary = summary(&output);
@@ -106,12 +106,12 @@ fn a_strict_run_ends_at_the_first_damaged_image() {
         let error = ended.stderr.lines().find(|line| line.starts_with("error: ")).unwrap();
         assert!(error.contains(image(&folder, 9).to_str().unwrap()), "{error}");
         assert!(error.contains("damaged PNG"), "{error}");
-        assert!(error.ends_with("the results are of the 9 frames before"), "{error}");
+        assert!(error.ends_with("the results cover the 9 frames before it"), "{error}");
     }
 }
 
 #[test]
-fn a_recording_without_one_good_image_is_an_error() {
+fn a_recording_without_a_valid_image_is_an_error() {
     let rig = Rig::new();
     let folder = rendered(&rig, FRAMES);
     (0..FRAMES).for_each(|frame| cut(&image(&folder, frame)));

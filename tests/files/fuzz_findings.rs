@@ -1,5 +1,5 @@
-//! What fuzzing starts from and what it has found, through the same functions as in `fuzz/`: each finding is
-//! a file in `fuzz/findings/TARGET/`.
+//! The seeds and past findings of fuzzing, run through the same functions as in `fuzz/`: each finding is a file in
+//! `fuzz/findings/TARGET/`.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -9,7 +9,7 @@ use crate::{parsers, seeds};
 
 type Target = (&'static str, fn(&[u8]));
 
-/// Every target. A new one is listed here and in `fuzz/Cargo.toml`.
+/// Every target. New ones are listed here and in `fuzz/Cargo.toml`.
 const TARGETS: [Target; 11] = [
     ("trajectory", parsers::trajectory),
     ("rig", parsers::rig),
@@ -25,13 +25,13 @@ const TARGETS: [Target; 11] = [
 ];
 
 #[test]
-fn every_seed_is_taken_whole_cut_and_broken() {
+fn every_seed_is_accepted_whole_truncated_and_damaged() {
     let mut seen = BTreeMap::new();
     for seed in seeds::seeds() {
         let (_, run) = TARGETS.iter().find(|(name, _)| *name == seed.target).expect(seed.target);
         *seen.entry(seed.target).or_insert(0) += 1;
         run(&seed.bytes);
-        // Some cuts and some flipped bytes, spread over it.
+        // Some truncations and flipped bytes, spread over the seed.
         for i in 0..20 {
             let place = i * seed.bytes.len() / 20;
             run(&seed.bytes[..place]);
@@ -44,7 +44,7 @@ fn every_seed_is_taken_whole_cut_and_broken() {
 }
 
 #[test]
-fn what_was_found_stays_mended() {
+fn past_findings_stay_fixed() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/findings");
     let mut count = 0;
     for (name, run) in TARGETS {
@@ -58,7 +58,7 @@ fn what_was_found_stays_mended() {
 }
 
 #[test]
-fn every_target_is_built_and_fed() {
+fn every_target_is_in_the_manifest() {
     let manifest =
         fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/Cargo.toml")).unwrap();
     for (name, _) in TARGETS {

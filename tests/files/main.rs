@@ -1,4 +1,4 @@
-//! What is read and written: recordings, damaged and wrong inputs, maps, results.
+//! Input and output files: recordings, damaged and wrong inputs, maps, results.
 
 #[path = "../support/recordings.rs"]
 mod recording;

@@ -1,4 +1,4 @@
-//! The map's points as files: one surface of all keyframes, and what is written on request.
+//! The map's points as files: one surface from all keyframes, and further files on request.
 
 use crate::records::{keyframe, pose, record, write_results, written};
 use semidense::service::results::ResultsParams;
@@ -9,8 +9,8 @@ use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::slam::pose::TrackingState;
 
 #[test]
-fn a_wall_that_two_keyframes_see_is_written_once_and_every_point_on_request() {
-    // Side by side by a pixel, in front of a wall at 4 keyframe units, which are 2 map units.
+fn a_wall_seen_by_two_keyframes_is_written_once_and_every_point_on_request() {
+    // Offset sideways by one pixel, in front of a wall at 4 keyframe units, which are 2 map units.
     let pixels = (0..24u16).flat_map(|v| (0..32u16).map(move |u| (u, v)));
     let points: Vec<DepthPoint> = pixels
         .map(|(u, v)| DepthPoint { u, v, inverse_depth: 0.25, variance: 1e-6, intensity: 100.0 })
@@ -32,14 +32,14 @@ fn a_wall_that_two_keyframes_see_is_written_once_and_every_point_on_request() {
     assert!(!first.join("map.pcd").exists() && !first.join("points-full.ply").exists());
     let surface = read_surface(&first.join("map.ply"), usize::MAX).unwrap();
     assert_eq!(summary["map_points"], surface.len());
-    // Each has one column that the other has not; at 0.5 % of the distance each pixel has a cell of its own.
+    // Each has one column that the other lacks; at 0.5 % of the distance each pixel has its own cell.
     assert!((700..=792).contains(&surface.len()), "{}", surface.len());
     let two = surface.iter().filter(|point| point.keyframes == 2).count();
     assert!(two * 10 > surface.len() * 9, "{two} of {}", surface.len());
     for point in &surface {
         assert!((point.position[2] - 2.0).abs() < 1e-5 && point.grey == 100, "{point:?}");
         assert_eq!(point.normal, [0.0, 0.0, -1.0], "towards the camera");
-        // σ/d is 0.004: at 2 map units and more.
+        // σ/d is 0.004, at 2 map units and more.
         assert!((0.0079..0.0105).contains(&point.sigma), "{point:?}");
     }
     prepare_output(&second).unwrap();
@@ -64,7 +64,7 @@ fn a_wall_that_two_keyframes_see_is_written_once_and_every_point_on_request() {
     assert_eq!(full.len() - begin, 3 * 768 * 24, "every point of every keyframe, of both epochs");
     let z = f32::from_le_bytes(full[begin + 8..begin + 12].try_into().unwrap());
     assert!((z - 2.0).abs() < 1e-6, "4 keyframe units are 2 map units");
-    // The next set has neither.
+    // The next result set has neither file.
     write_results(&second, &record, &ResultsParams::default());
     assert!(!second.join("map.pcd").exists() && !second.join("points-full.ply").exists());
 }

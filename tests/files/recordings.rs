@@ -1,11 +1,11 @@
-//! The readers against recordings of real cameras, where these are on the machine.
+//! The readers on recordings of real cameras, if these are on the machine.
 
 use crate::recording::recording;
 use semidense::capture::opening::{SourceParams, open};
 use semidense::capture::source_name::SourceName;
 
 #[test]
-fn every_recording_is_read_whole() {
+fn every_recording_is_read_completely() {
     let params = SourceParams::default();
     for (name, frames, poses, depths) in [
         ("redkitchen", 500, 503, 125),

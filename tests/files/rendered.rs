@@ -1,10 +1,10 @@
-//! A recording that is rendered for a test.
+//! A recording rendered for a test.
 
 use std::path::PathBuf;
 
 use crate::support::{Rig, finish};
 
-/// A recording of so many small simulated frames, in TUM layout.
+/// A recording of `frames` small simulated frames, in TUM layout.
 pub fn rendered(rig: &Rig, frames: usize) -> PathBuf {
     let folder = rig.folder().join("recording");
     let mut command = rig.command(&["simulate", "--force", "--output"]);

@@ -1,4 +1,4 @@
-//! `semidense replay`: deterministic, whatever the number of threads, and its results are whole.
+//! `semidense replay`: deterministic for any number of threads, with complete results.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -40,7 +40,7 @@ fn the_map_of_given_poses_has_the_same_bits_for_one_two_and_four_threads() {
 }
 
 #[test]
-fn given_poses_come_back_and_their_depth_is_judged() {
+fn given_poses_are_returned_and_their_depth_is_evaluated() {
     let folder = tempfile::tempdir().unwrap();
     let arguments = ["sim", "--frames", "60", "--poses", "groundtruth", "--json"];
     let output = replay(&arguments, folder.path());
@@ -57,7 +57,7 @@ fn given_poses_come_back_and_their_depth_is_judged() {
 }
 
 #[test]
-fn a_replay_says_what_a_budget_buys_and_what_the_covariance_is_worth() {
+fn a_replay_reports_the_budget_curve_and_the_consistency_of_the_covariance() {
     let folder = tempfile::tempdir().unwrap();
     let arguments = ["sim", "--frames", "80", "--debug-images", "--json"];
     let output = replay(&[&arguments[..], &HALF_SIZE].concat(), folder.path());
@@ -83,7 +83,7 @@ fn a_replay_says_what_a_budget_buys_and_what_the_covariance_is_worth() {
 }
 
 #[test]
-fn what_the_covariance_allows_for_is_for_readers_only() {
+fn allowances_of_the_covariance_do_not_affect_the_map() {
     let folder = tempfile::tempdir().unwrap();
     let runs = [("0", "0"), ("0.02", "2.8"), ("5", "50")].map(|(image_px, ratio)| {
         let image = format!("tracking.covariance_floor.image_px={image_px}");
@@ -101,10 +101,10 @@ fn what_the_covariance_allows_for_is_for_readers_only() {
     assert!(none > 1.1 * usual && usual > 3.0 * wide, "{none} {usual} {wide}");
 }
 
-/// With the map's own depth, where errors are alike over a keyframe. Measured: 1.0 and 0.9; without the common errors and
-/// the displacement of the image 5.3 and 7.5, with a displacement of a whole pixel 0.02.
+/// With the map's own depth, whose errors are correlated over a keyframe. Measured: 1.0 and 0.9; without the common
+/// errors and the displacement of the image 5.3 and 7.5, with a displacement of a whole pixel 0.02.
 #[test]
-fn the_published_covariance_is_as_wide_as_the_errors_in_a_simulated_room() {
+fn the_published_covariance_matches_the_errors_in_a_simulated_room() {
     for seed in ["1", "4"] {
         let folder = tempfile::tempdir().unwrap();
         let seed = format!("simulator.seed={seed}");
@@ -116,7 +116,7 @@ fn the_published_covariance_is_as_wide_as_the_errors_in_a_simulated_room() {
         assert!(figure("nees_frames") > 150.0);
         let median = figure("nees_median");
         assert!((0.4..=3.0).contains(&median), "{seed}: {median}");
-        // The errors of the depth itself over what its keyframes claim: 0.67 is right.
+        // The errors of the depth itself relative to what its keyframes claim: 0.67 is correct.
         let modes = summary["depth_modes_whitened"].as_array().unwrap();
         let modes: Vec<f64> = modes.iter().map(|mode| mode.as_f64().unwrap()).collect();
         assert!(modes.iter().all(|&mode| mode < 1.5), "{seed}: {modes:?}");
@@ -124,9 +124,9 @@ fn the_published_covariance_is_as_wide_as_the_errors_in_a_simulated_room() {
     }
 }
 
-/// The same of the filter's depth, without a joint estimate.
+/// The same for the depth of the filter, without a joint estimate.
 #[test]
-fn keyframes_know_how_tilted_the_depth_of_the_filter_is() {
+fn keyframes_estimate_the_tilt_of_the_filters_depth() {
     for seed in ["1", "4"] {
         let folder = tempfile::tempdir().unwrap();
         let seed = format!("simulator.seed={seed}");
@@ -143,7 +143,7 @@ fn keyframes_know_how_tilted_the_depth_of_the_filter_is() {
 }
 
 #[test]
-fn what_cannot_be_replayed_is_one_clear_line() {
+fn sources_that_cannot_be_replayed_give_one_clear_line() {
     let folder = tempfile::tempdir().unwrap();
     let empty = format!("tum:{}", folder.path().display());
     for (arguments, part) in [
@@ -160,7 +160,7 @@ fn what_cannot_be_replayed_is_one_clear_line() {
 }
 
 #[test]
-fn a_name_that_is_none_is_refused_before_the_work() {
+fn an_invalid_instance_name_is_refused_before_the_work() {
     let folder = tempfile::tempdir().unwrap();
     let replayed = Command::new(env!("CARGO_BIN_EXE_semidense"))
         .args(["replay", "sim", "--instance", "a/b", "--output"])
@@ -196,7 +196,7 @@ fn results_survive_a_replay_that_is_interrupted_before_its_first_frame() {
 }
 
 #[test]
-fn results_are_of_the_frames_before_one_that_cannot_be_read() {
+fn results_cover_the_frames_before_one_that_cannot_be_read() {
     let folder = tempfile::tempdir().unwrap();
     let (recording, output) = (folder.path().join("recording"), folder.path().join("output"));
     let sizes = ["--set", "simulator.width=160", "--set", "simulator.height=120"];
@@ -223,7 +223,7 @@ fn results_are_of_the_frames_before_one_that_cannot_be_read() {
     };
     let (code, said, summary) = replayed(&["--strict"]);
     assert_eq!(code, Some(1), "{said}");
-    assert!(said.contains("the results are of the 5 frames before"), "{said}");
+    assert!(said.contains("the results cover the 5 frames before it"), "{said}");
     assert_eq!(summary["frames_in"], 5);
     let (code, said, summary) = replayed(&[]);
     // It continues to the end, where seven frames were too few to start a map.

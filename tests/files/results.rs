@@ -1,4 +1,4 @@
-//! The files that a run leaves behind, from records made by hand.
+//! The files that a run leaves behind, from handmade records.
 
 use crate::records::{UNIT_M, keyframe, nanos, pose, record, written};
 use semidense::service::adjustments::{AdjustmentRecord, Fate, SearchRecord};
@@ -19,7 +19,7 @@ use semidense::slam::window::Adjustment;
 use std::path::Path;
 
 #[test]
-fn frames_aligned_afterwards_count_where_the_map_was_tracked_on() {
+fn frames_aligned_afterwards_count_only_if_the_map_was_tracked_on() {
     let placed = |record: &RunRecord| -> RunRecord {
         let mut record = record.clone();
         for sequence in 0..3 {
@@ -83,7 +83,7 @@ fn figures_and_files_of_a_run_with_truth_and_a_loss() {
         "iterations_median": 2.0, "iterations_mean": 3.0, "nanos_per_point": 3.0 }]);
     assert_eq!(summary["alignment_levels"], levels);
     assert!(summary["latency_ms"].is_null() && summary["deadline_ms"].is_null());
-    // The published poses are right to their scale; the final ones have the keyframe moved.
+    // The published poses are correct up to their scale; in the final ones the keyframe has moved.
     assert!(summary["online"]["ate_rmse_m"].as_f64().unwrap() < 1e-9);
     assert!((summary["online"]["ate_scale"].as_f64().unwrap() - UNIT_M).abs() < 1e-9);
     assert!(summary["ate_rmse_m"].as_f64().unwrap() > 0.01);
@@ -133,7 +133,7 @@ fn joint_estimates_are_in_summary_and_report_and_their_points_in_a_file() {
     let poses = (0..60).map(|i| pose(i, TrackingState::Tracking, u64::from(i >= 40))).collect();
     let mut record = record(poses, vec![keyframe(0), keyframe(1)], false);
     record.adjustments = fates.map(|(sequence, fate)| estimate(sequence, fate)).to_vec();
-    // One whose keyframe is gone has no place.
+    // A point whose keyframe is gone has no position.
     record.map.confirmed = vec![point(0, 1), point(1, 1), point(5, 1)];
     let folder = tempfile::tempdir().unwrap();
     let (summary, report) = written(folder.path(), &record);
@@ -199,7 +199,7 @@ fn searches_for_loops_are_in_summary_and_report() {
     for part in [
         "<h2>Loops</h2>",
         "5 keyframes searched, 1 closed, 0 held already",
-        "2 times both directions disagree; 1 time too few points are inliers",
+        "2 times the two directions disagree; 1 time too few points are inliers",
         "Loops from above",
         "against the drift",
     ] {
@@ -208,15 +208,15 @@ fn searches_for_loops_are_in_summary_and_report() {
 }
 
 #[test]
-fn of_several_epochs_the_longest_is_judged_and_all_are_written() {
+fn the_longest_of_several_epochs_is_evaluated_and_all_are_written() {
     let mut poses: Vec<_> = (0..60).map(|i| pose(i, TrackingState::Tracking, 0)).collect();
     for pose in &mut poses[20..] {
-        // The second epoch has another origin and another unit.
+        // The second epoch has a different origin and unit.
         pose.estimate.epoch = 1;
         pose.estimate.keyframe_id = 1;
         pose.estimate.world_from_camera.translation *= 3.0;
         pose.estimate.world_from_camera.translation.x += 100.0;
-        // No keyframe of the final map has it.
+        // The final map has no keyframe for it.
         pose.estimate.map_from_camera = pose.estimate.world_from_camera;
     }
     let folder = tempfile::tempdir().unwrap();
@@ -243,7 +243,7 @@ fn poses_by_epoch(path: &Path) -> Vec<(String, usize)> {
 }
 
 #[test]
-fn trajectories_say_where_another_epoch_begins() {
+fn trajectories_mark_where_another_epoch_begins() {
     let epoch_of = |i: usize| if (20..40).contains(&i) { 1 } else { 0 };
     let state = |i| match i {
         15..20 => TrackingState::Lost(LostReason::TooFewInliers),
@@ -258,7 +258,7 @@ fn trajectories_say_where_another_epoch_begins() {
             pose.estimate.map_covariance[place] = 1e-4;
         }
         if i >= 20 {
-            // Odometry begins with another unit.
+            // Odometry starts with another unit.
             pose.estimate.world_from_camera.translation *= 3.0;
         }
     }
@@ -276,11 +276,11 @@ fn trajectories_say_where_another_epoch_begins() {
         ["trajectory.txt", "trajectory_online.txt"]
             .map(|name| poses_by_epoch(&folder.path().join(name)))
     };
-    // Odometry stays in the second world when the first epoch is taken up again.
+    // Odometry stays in the second world when the first epoch is resumed.
     let online = vec![part("0", 15), part("1", 40)];
     let apart = vec![part("0", 15), part("1", 22), part("0", 20)];
     assert_eq!(parts(&record), [apart, online.clone()]);
-    // The figures of the run are what `evaluate` finds for its longest epoch.
+    // The figures of the run equal those of `evaluate` for its longest epoch.
     let folder = tempfile::tempdir().unwrap();
     let (summary, _) = written(folder.path(), &record);
     let file = read_trajectory_file(&folder.path().join("trajectory.txt")).unwrap();
@@ -295,29 +295,29 @@ fn trajectories_say_where_another_epoch_begins() {
         let expected = summary[key].as_f64().unwrap();
         assert!((found - expected).abs() < 1e-9, "{key}: {found}, {expected}");
     }
-    // Units of two epochs have nothing to do with each other.
+    // The units of two epochs are unrelated.
     assert!(summary["depth_scale_ratio"].is_null(), "{}", summary["depth_scale_ratio"]);
-    // Joined to the first in the end: one map, and still two worlds of odometry.
+    // Joined to the first at the end: one map, but still two worlds of odometry.
     record.map.keyframes[1].epoch = 0;
     assert_eq!(parts(&record), [vec![part("", 57)], online]);
     let (summary, _) = written(folder.path(), &record);
     let odometry = &summary["online"];
     assert_eq!(odometry["matched_poses"], 40);
     assert!(odometry["ate_rmse_m"].as_f64().unwrap() < 1e-9, "{odometry}");
-    // Frames of the second epoch were placed in a map of their own.
+    // Frames of the second epoch were placed in a separate map.
     assert_eq!(summary["map_nees"]["nees_frames"], 35);
     assert_eq!(summary["depth_scale_ratio"], 1.0);
 }
 
 #[test]
-fn frames_that_got_their_pose_afterwards_are_not_lost_and_their_epoch_counts() {
+fn frames_with_a_pose_assigned_afterwards_are_not_lost_and_their_epoch_counts() {
     let state = |i| match i {
         40.. => TrackingState::Lost(LostReason::TooFewInliers),
         _ => TrackingState::Tracking,
     };
     let poses = (0..60).map(|i| pose(i, state(i), 0)).collect();
     let mut record = record(poses, vec![keyframe(0), keyframe(1)], false);
-    // A second epoch began with the last frames: none was tracked on it when it came.
+    // A second epoch began with the last frames: none was tracked on it when it arrived.
     record.map.keyframes[1].epoch = 1;
     for sequence in 50..60 {
         let keyframe_from_camera = SE3::identity();
@@ -339,7 +339,7 @@ fn frames_that_got_their_pose_afterwards_are_not_lost_and_their_epoch_counts() {
     let reasons = summary["grade"]["reasons"].to_string();
     assert!(reasons.contains("for 16.7 % of the frames"), "{reasons}");
     assert!(report.contains("for 16.7 % of the frames"));
-    // Joined to the first, it is none of its own.
+    // Joined to the first, it is no longer a separate epoch.
     record.map.keyframes[1].epoch = 0;
     assert_eq!(written(folder.path(), &record).0["epochs"], 1);
 }
@@ -358,11 +358,11 @@ fn a_run_without_truth_keyframes_or_a_tracked_frame_is_reported_too() {
 }
 
 #[test]
-fn what_was_given_is_not_judged_as_if_it_was_estimated() {
+fn given_poses_and_depth_are_not_judged_as_estimates() {
     let poses = |epochs: u32| {
         let mut poses: Vec<_> = (0..60).map(|i| pose(i, TrackingState::Tracking, 0)).collect();
         for pose in &mut poses[30..] {
-            // On a keyframe of its own, which the map does not hold.
+            // On a separate keyframe, which the map does not contain.
             (pose.estimate.epoch, pose.estimate.keyframe_id) = (epochs - 1, 1);
         }
         poses
@@ -371,7 +371,7 @@ fn what_was_given_is_not_judged_as_if_it_was_estimated() {
     let estimated = record(poses(2), vec![keyframe(0)], true);
     let summary = of(&estimated);
     assert!(summary["depth_relative_error_median"].is_number());
-    assert!(summary["grade"]["reasons"].to_string().contains("a scale of its own"), "{summary}");
+    assert!(summary["grade"]["reasons"].to_string().contains("its own scale"), "{summary}");
     let of_keyframes = summary["keyframe_depth"].as_array().unwrap();
     assert_eq!(of_keyframes.len(), 1);
     assert!(of_keyframes[0]["units_per_metre"].as_f64().unwrap() > 0.0, "{summary}");
@@ -394,7 +394,7 @@ fn a_long_run_makes_a_small_report() {
 }
 
 #[test]
-fn a_place_that_cannot_be_written_is_an_error_that_names_it() {
+fn an_unwritable_path_is_an_error_that_names_it() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("file");
     std::fs::write(&file, "").unwrap();

@@ -1,4 +1,4 @@
-//! A run that tracks nothing ends with its own exit code and the right cause.
+//! A run that tracks nothing ends with a dedicated exit code and the right cause.
 
 use std::fs;
 use std::path::Path;
@@ -11,10 +11,10 @@ const WIDTH: usize = 160;
 const HEIGHT: usize = 120;
 const FOCAL_PX: f64 = 150.0;
 const FRAMES: usize = 20;
-/// Exit code of a run that has tracked nothing.
+/// Exit code of a run that tracked nothing.
 const NOTHING_TRACKED: i32 = 3;
 
-/// Grey values of a random pattern of soft blobs, the same for the same seed.
+/// Grey values of a random pattern of soft blobs, the same for equal seeds.
 fn pattern(seed: u64, u: f64, v: f64) -> u8 {
     let value = |x: i64, y: i64| {
         let mut z = (x as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15)
@@ -33,7 +33,7 @@ fn pattern(seed: u64, u: f64, v: f64) -> u8 {
     (30.0 + 190.0 * (top * (1.0 - b) + bottom * b)) as u8
 }
 
-/// What a camera sees of a pattern far away that turns about its vertical axis, two pixels a frame.
+/// A distant pattern, seen by a camera that rotates about its vertical axis, two pixels per frame.
 fn turned(frame: usize, u: usize, v: usize) -> u8 {
     let (x, y) = ((u as f64 - 79.5) / FOCAL_PX, (v as f64 - 59.5) / FOCAL_PX);
     let (sin, cos) = (2.0 * frame as f64 / FOCAL_PX).sin_cos();
@@ -41,12 +41,12 @@ fn turned(frame: usize, u: usize, v: usize) -> u8 {
     pattern(1, FOCAL_PX * (x * cos + sin) / depth, FOCAL_PX * y / depth)
 }
 
-/// Black and white, and nothing of a frame is in the next.
+/// Black and white, with nothing in common between frames.
 fn flicker(frame: usize, u: usize, v: usize) -> u8 {
     if pattern(frame as u64, u as f64, v as f64) > 125 { 250 } else { 5 }
 }
 
-/// A recording in the layout of TUM whose pixels are those of `pixel(frame, u, v)`.
+/// Writes a recording in TUM layout whose pixels are those of `pixel(frame, u, v)`.
 fn record(folder: &Path, frames: usize, pixel: impl Fn(usize, usize, usize) -> u8) -> String {
     record_sized(folder, frames, [WIDTH, HEIGHT], pixel)
 }
@@ -76,7 +76,7 @@ fn record_sized(
     format!("tum:{}", folder.display())
 }
 
-/// Holds a run to exit code 3 and to a cause, on standard error and in the summary.
+/// Checks that a run ends with exit code 3 and a cause, on standard error and in the summary.
 fn assert_untracked(mut command: Command, output: &Path, cause: &str) {
     let ended = finish({
         command.args(["--json", "--output"]).arg(output);
@@ -92,7 +92,7 @@ fn assert_untracked(mut command: Command, output: &Path, cause: &str) {
 }
 
 #[test]
-fn what_the_images_lack_is_said() {
+fn the_defect_of_the_images_is_reported() {
     let rig = Rig::new();
     type Pixel = fn(usize, usize, usize) -> u8;
     let cases: [(&str, Pixel, &str); 6] = [
@@ -116,7 +116,7 @@ fn what_the_images_lack_is_said() {
 }
 
 #[test]
-fn where_the_results_are_is_said_once() {
+fn the_folder_of_the_results_is_printed_once() {
     let rig = Rig::new();
     let source = record(&rig.folder().join("few"), 3, turned);
     let output = rig.output();
@@ -133,10 +133,10 @@ fn where_the_results_are_is_said_once() {
 }
 
 #[test]
-fn a_machine_that_is_too_slow_is_said() {
+fn a_machine_that_is_too_slow_is_reported() {
     let rig = Rig::new();
-    // Nothing of a frame is in any other, so that nothing is tracked on any machine; and none handles a thousand
-    // frames of this size in a second.
+    // Frames have nothing in common, so that nothing is tracked on any machine; and no machine processes a thousand
+    // frames of this size per second.
     let size = [640, 480];
     let source = record_sized(&rig.folder().join("flicker"), FRAMES, size, flicker);
     let command = rig.command(&["run", "--live", "--source", &format!("loop:200:1000:{source}")]);

@@ -1,5 +1,5 @@
-//! What the real binary does with cameras that are missing, are none, or are asked for wrongly. Cameras
-//! that are there are the matter of `deploy/robot-test`.
+//! The real binary with cameras that are missing, are not cameras, or are requested wrongly. Existing cameras are
+//! tested in `deploy/robot-test`.
 
 use std::io::Write;
 use std::os::unix::net::UnixStream;
@@ -45,11 +45,11 @@ fn a_camera_needs_a_rig_and_does_not_wait() {
 }
 
 #[test]
-fn what_is_no_camera_ends_the_run() {
+fn a_device_that_is_not_a_camera_ends_the_run() {
     let rig = Rig::new();
     for command in ["run", "capture"] {
         let ended = finish(start(&rig, command, "v4l:/dev/null", &["--rig", WEBCAM]));
-        assert_refused(&ended, &["/dev/null: is not a camera", "it is not a video device"]);
+        assert_refused(&ended, &["/dev/null: is not a usable camera", "it is not a video device"]);
     }
     assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
@@ -70,13 +70,13 @@ fn a_missing_camera_is_a_state() {
     signal(&child, Signal::INT);
     let ended = end(child);
     assert_eq!(ended.status.code(), Some(130), "{}", ended.stderr);
-    // Said once, however often it is tried.
+    // Printed once, however often it is tried.
     assert_eq!(ended.stderr.matches("there is no camera").count(), 1, "{}", ended.stderr);
     assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
 
 #[test]
-fn the_first_frames_of_a_stream_are_no_warning() {
+fn the_first_frames_of_a_stream_cause_no_warning() {
     let rig = Rig::new();
     let socket = rig.folder().join("frames");
     let source = format!("stream:{}", socket.display());
@@ -95,12 +95,12 @@ fn the_first_frames_of_a_stream_are_no_warning() {
     until("that it runs", || is_in("running"));
     signal(&child, Signal::INT);
     let ended = end(child);
-    let line = ended.stderr.lines().find(|line| line.contains("frames are coming"));
+    let line = ended.stderr.lines().find(|line| line.contains("frames are arriving"));
     assert!(line.is_some_and(|line| line.contains(" INFO ")), "{}", ended.stderr);
 }
 
 #[test]
-fn a_run_says_once_that_it_waits_for_a_camera() {
+fn a_run_prints_once_that_it_waits_for_a_camera() {
     let rig = Rig::new();
     for more in [&[][..], &["--json"]] {
         let arguments = [&["--rig", WEBCAM], more].concat();
@@ -111,7 +111,7 @@ fn a_run_says_once_that_it_waits_for_a_camera() {
             assert!(std::io::BufRead::read_line(&mut said, &mut lines).unwrap() > 0, "{lines}");
         }
         assert!(lines.contains("waiting: there is no camera"), "{lines}");
-        // A second line would come with it.
+        // Time for a second line to appear.
         std::thread::sleep(std::time::Duration::from_millis(500));
         signal(&child, Signal::INT);
         std::io::Read::read_to_string(&mut said, &mut lines).unwrap();

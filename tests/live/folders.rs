@@ -1,4 +1,4 @@
-//! Folders that runs write into: one run at a time, nothing empty left behind, and what a recovery makes of them.
+//! Output folders of runs: one run at a time, no empty remains, and their recovery.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -13,10 +13,10 @@ use serde_json::Value;
 const INTERRUPTED: i32 = 130;
 const NOTHING_TRACKED: i32 = 3;
 
-/// A sequence without end in sight from few pictures.
+/// A practically endless sequence from few pictures.
 const ENDLESS: &str = "loop:200000:30:sim";
 
-/// So many frames that their preparation lasts until it is interrupted.
+/// Enough frames that their preparation lasts until it is interrupted.
 const LONG_PREPARATION: &str = "simulator.frames=3000";
 
 fn command(rig: &Rig, arguments: &[&str]) -> Command {
@@ -42,7 +42,7 @@ fn names(folder: &Path) -> Vec<String> {
 }
 
 #[test]
-fn two_runs_cannot_write_into_one_folder() {
+fn two_runs_cannot_write_to_one_folder() {
     let rig = Rig::new();
     let output = rig.output();
     let to = output.to_str().unwrap();
@@ -65,7 +65,7 @@ fn two_runs_cannot_write_into_one_folder() {
 }
 
 #[test]
-fn a_run_that_is_interrupted_while_it_prepares_leaves_no_folder() {
+fn a_run_interrupted_during_its_preparation_leaves_no_folder() {
     let rig = Rig::new();
     let outer = rig.folder().join("new");
     let output = outer.join("output");
@@ -94,7 +94,7 @@ fn a_run_that_is_interrupted_while_it_prepares_leaves_no_folder() {
 }
 
 #[test]
-fn a_simulation_ends_in_order_on_every_signal() {
+fn a_simulation_ends_cleanly_on_every_signal() {
     let rig = Rig::new();
     let folder = rig.folder().join("made");
     fs::create_dir(&folder).unwrap();
@@ -119,7 +119,7 @@ fn recover(rig: &Rig, here: &Path) -> Ended {
 }
 
 #[test]
-fn a_recovery_says_that_it_is_one_and_what_it_lacks() {
+fn a_recovery_is_marked_as_such_and_reports_what_is_missing() {
     let rig = Rig::new();
     let here = rig.folder().join("here");
     fs::create_dir(&here).unwrap();
@@ -131,7 +131,7 @@ fn a_recovery_says_that_it_is_one_and_what_it_lacks() {
     });
     let journal = journal_of(&output, 500);
     kill(child);
-    // As on a disk that is full: depth has made room for poses.
+    // As on a full disk, where depth made room for poses.
     for name in names(&journal).iter().filter(|name| name.starts_with("keyframe-")) {
         fs::remove_file(journal.join(name)).unwrap();
     }
@@ -153,7 +153,7 @@ fn a_recovery_says_that_it_is_one_and_what_it_lacks() {
 }
 
 #[test]
-fn of_a_run_that_was_killed_while_it_prepared_there_is_nothing_to_recover() {
+fn a_run_killed_during_its_preparation_has_nothing_to_recover() {
     let rig = Rig::new();
     let here = rig.folder().join("here");
     fs::create_dir(&here).unwrap();
@@ -164,7 +164,7 @@ fn of_a_run_that_was_killed_while_it_prepared_there_is_nothing_to_recover() {
         entries.map(|entry| entry.path()).find(|path| path.is_dir())
     });
     let journal = journal_of(&output, 0);
-    // They tidy up once the supervisor is gone.
+    // They clean up once the supervisor is gone.
     until("all processes", || {
         let claims = ["capture", "tracker", "mapper"].map(|name| rig.place().claimant(name));
         claims.iter().all(Option::is_some).then_some(())
@@ -184,7 +184,7 @@ fn of_a_run_that_was_killed_while_it_prepared_there_is_nothing_to_recover() {
 }
 
 #[test]
-fn a_recovery_finds_a_source_whose_path_is_no_text() {
+fn a_recovery_finds_a_source_whose_path_is_not_utf8() {
     let rig = Rig::new();
     let (output, recording) = (rig.output(), rig.folder().join(OsStr::from_bytes(b"b\xffd")));
     let mut simulate = command(&rig, &["simulate", "--frames", "400"]);

@@ -1,5 +1,5 @@
-//! Frames that are broken, repeated, out of order or of a camera that nobody can use: tracker and mapper
-//! count them, live on, and take the good ones that follow.
+//! Frames that are malformed, repeated, out of order or from an unusable camera: tracker and mapper count them, live
+//! on, and process the valid ones that follow.
 
 use crate::support::{Rig, end, signal, until};
 use rustix::process::Signal;
@@ -10,10 +10,10 @@ use semidense::wire::port::{Access, Hub, Publisher};
 use semidense::wire::topic::{FRAME, MAPPER_HEALTH, TRACKER_HEALTH};
 
 const SIDE: usize = 64;
-/// Smaller than the mapper can use, and yet a camera by its numbers.
+/// Smaller than the mapper can use, yet a valid camera.
 const SMALL_SIDE: usize = 16;
 
-/// Stands for capture.
+/// Substitute for capture.
 struct Sender {
     frames: Publisher<u8, FrameHeader>,
     peers: [Peer; 2],
@@ -44,7 +44,7 @@ impl Sender {
         Self { frames: hub.publisher(&FRAME, SIDE * SIDE).unwrap(), peers, _hub: hub }
     }
 
-    /// Sends one frame, and waits until both say of `count` what they should.
+    /// Sends one frame, and waits until the health of both processes satisfies `count`.
     fn send(
         &mut self,
         header: FrameHeader,
@@ -63,7 +63,7 @@ impl Sender {
 }
 
 #[test]
-fn bad_frames_are_counted_and_the_next_good_one_is_used() {
+fn invalid_frames_are_counted_and_the_next_valid_one_is_used() {
     let rig = Rig::new();
     let children =
         ["tracker", "mapper"].map(|name| rig.command(&[name, "--live"]).spawn().unwrap());
@@ -88,14 +88,14 @@ fn bad_frames_are_counted_and_the_next_good_one_is_used() {
     let leap = FrameHeader { capture_nanos: i64::MAX, ..good(12) };
     sender.send(leap, size, "a leap of the clock", |health| health.disordered == 3);
     sender.send(good(13), size, "and back", |health| health.disordered == 4 && health.frames == 4);
-    // The tracker takes it, the mapper says why it does not.
+    // The tracker accepts it, the mapper reports why it does not.
     let small = header(14, SMALL_SIDE);
     let bytes = SMALL_SIDE * SMALL_SIDE;
     sender.send(small, bytes, "a tiny camera", |health| health.frames + health.refused >= 8);
     sender.send(good(15), size, "the camera before", |health| health.frames >= 5);
     for peer in &mut sender.peers {
         peer.update().unwrap();
-        // Stale where the next frame was waited for too long already.
+        // Stale if the next frame has been waited for too long already.
         let state = peer.state();
         let lives = matches!(state, Some(ProcessState::Running | ProcessState::Stale));
         assert!(lives, "{}: {state:?}", peer.name());

@@ -1,4 +1,4 @@
-//! What a run leaves on the disk, however it ends: killed, out of room, with nothing tracked.
+//! What a run leaves on disk, however it ends: killed, out of space, with nothing tracked.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -24,7 +24,7 @@ const FILES: [&str; 7] = [
     "report.html",
 ];
 
-/// A sequence without end in sight from few pictures: sixty frames back and forth.
+/// A practically endless sequence from few pictures: sixty frames back and forth.
 const ENDLESS: &str = "loop:200000:30:sim";
 
 fn command(rig: &Rig, arguments: &[&str]) -> Command {
@@ -35,7 +35,7 @@ fn command(rig: &Rig, arguments: &[&str]) -> Command {
     command
 }
 
-/// Every file below `folder`, hidden ones too, with its content.
+/// Every file below `folder`, including hidden ones, with its content.
 fn content(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
@@ -60,7 +60,7 @@ fn summary(folder: &Path) -> Value {
     serde_json::from_str(&fs::read_to_string(folder.join("summary.json")).unwrap()).unwrap()
 }
 
-/// Kills a run that has journaled some hundred frames, and says where its journal is.
+/// Kills a run that has journaled a few hundred frames; returns its journal.
 fn kill(child: Child, output: &Path) -> PathBuf {
     let journal = journal_of(output, 500);
     signal(&child, Signal::KILL);
@@ -68,13 +68,13 @@ fn kill(child: Child, output: &Path) -> PathBuf {
     journal
 }
 
-/// Lines of a file that are no comment.
+/// Lines of a file that are not comments.
 fn lines(path: &Path) -> Vec<String> {
     let text = fs::read_to_string(path).unwrap();
     text.lines().filter(|line| !line.starts_with('#')).map(str::to_owned).collect()
 }
 
-/// Recovers `output` and holds it to an undisturbed replay of as many frames.
+/// Recovers `output` and compares it with an undisturbed replay of as many frames.
 fn assert_recovered(rig: &Rig, output: &Path) -> Ended {
     let ended = finish(rig.command(&["recover", output.to_str().unwrap()]));
     assert!(ended.status.success(), "{}", ended.stderr);
@@ -91,15 +91,15 @@ fn assert_recovered(rig: &Rig, output: &Path) -> Ended {
     let (all, mine) = pair("trajectory_online.txt");
     assert!(mine.len() >= 400, "{} poses", mine.len());
     assert!(mine == all, "trajectory_online.txt differs");
-    // Final poses were estimated again at the end of the other one, and frames that were aligned again, or to a map that
-    // began after them, are not journaled: the same frames but for those, nearly in the same places.
+    // The replay estimated final poses again at its end, and realigned frames, or frames aligned to a map that began
+    // after them, are not journaled: the same frames except for those, at nearly the same poses.
     let (all, mine) = pair("trajectory.txt");
     let expected = summary(&whole);
     let later = expected["frames_tracked_later"].as_u64().unwrap();
     assert_eq!(mine.len() as u64 + later, all.len() as u64);
     let tracked = |of: &Value| of["frames_tracked"].as_u64().unwrap();
     assert_eq!(tracked(&found) + later, tracked(&expected));
-    // Where the truth is known.
+    // If the truth is known.
     assert_eq!(found["matched_poses"].is_null(), expected["matched_poses"].is_null());
     if let (Some(found), Some(expected)) =
         (found["matched_poses"].as_u64(), expected["matched_poses"].as_u64())
@@ -114,7 +114,7 @@ fn assert_recovered(rig: &Rig, output: &Path) -> Ended {
     let [apart, path] = ["ate_rmse_m", "path_length_m"].map(|key| compared[key].as_f64().unwrap());
     assert!(apart < 0.01 * path, "{apart} apart on {path}");
     assert!(found["adjustments"].as_u64() > Some(0), "{found}");
-    // The newest keyframe may have come after the last writing, the start's first frame is never published.
+    // The newest keyframe may have arrived after the last write, and the start's first frame is never published.
     let (mine, all) = (&found["keyframes"], &expected["keyframes"]);
     let keyframes = |value: &Value| value.as_u64().unwrap();
     assert!(keyframes(mine) + 2 >= keyframes(all) && keyframes(mine) > 0, "{mine} of {all}");
@@ -123,7 +123,7 @@ fn assert_recovered(rig: &Rig, output: &Path) -> Ended {
 }
 
 #[test]
-fn a_run_whose_supervisor_is_killed_is_recovered() {
+fn a_run_with_a_killed_supervisor_is_recovered() {
     let rig = Rig::new();
     let output = rig.output();
     let arguments = ["run", "--source", ENDLESS, "--output", output.to_str().unwrap()];
@@ -153,12 +153,12 @@ fn a_run_whose_supervisor_is_killed_is_recovered() {
 }
 
 #[test]
-fn a_replay_that_is_killed_is_recovered() {
+fn a_killed_replay_is_recovered() {
     let rig = Rig::new();
     let output = rig.output();
     let arguments = ["replay", ENDLESS, "--output", output.to_str().unwrap()];
     let journal = kill(command(&rig, &arguments).spawn().unwrap(), &output);
-    // A run that died while it wrote.
+    // A run that died during a write.
     let log = fs::File::options().append(true).open(journal.join("log")).unwrap();
     std::io::Write::write_all(&mut &log, &[77; 300]).unwrap();
     assert_recovered(&rig, &output);
@@ -186,7 +186,7 @@ fn later_results_are_not_replaced_by_a_recovery() {
 }
 
 #[test]
-fn depth_from_before_a_mappers_death_is_in_the_final_map() {
+fn depth_of_a_mapper_that_died_is_in_the_final_map() {
     let rig = Rig::new();
     let output = rig.output();
     let child = rig.run(450, &["--live"]).spawn().unwrap();
@@ -215,7 +215,7 @@ fn depth_from_before_a_mappers_death_is_in_the_final_map() {
 }
 
 #[test]
-fn a_run_that_tracks_nothing_keeps_the_results_before() {
+fn a_run_that_tracks_nothing_keeps_the_earlier_results() {
     let rig = Rig::new();
     let output = rig.output();
     let good = ["replay", "sim", "--frames", "20", "--output", output.to_str().unwrap()];
@@ -231,14 +231,14 @@ fn a_run_that_tracks_nothing_keeps_the_results_before() {
 }
 
 #[test]
-fn a_full_disk_leaves_the_set_before_and_the_journal() {
+fn a_full_disk_leaves_the_earlier_results_and_the_journal() {
     let rig = Rig::new();
     let binary = env!("CARGO_BIN_EXE_semidense");
     let mount = rig.folder().join("disk");
     let settings: Vec<String> =
         small_camera(60).iter().map(|s| format!("--set simulator.{s}")).collect();
     let settings = settings.join(" ");
-    // The first run fits; then everything but so many kB is taken before the second begins.
+    // The first run fits; then all but a given number of kB is taken before the second begins.
     let script = format!(
         "{binary} replay sim --frames 20 --output {mount}/out {settings} >/dev/null 2>&1 || exit 98
          cat {mount}/out/* | cksum > {mount}/sum
@@ -272,7 +272,7 @@ fn a_full_disk_leaves_the_set_before_and_the_journal() {
 }
 
 #[test]
-fn every_run_has_a_folder_of_its_own_and_the_link_leads_to_the_newest() {
+fn every_run_has_its_own_folder_and_the_link_leads_to_the_newest() {
     let rig = Rig::new();
     let here = rig.folder().join("here");
     fs::create_dir(&here).unwrap();
@@ -291,7 +291,7 @@ fn every_run_has_a_folder_of_its_own_and_the_link_leads_to_the_newest() {
     let latest = fs::read_link(here.join("output/latest")).unwrap();
     let is_latest = |ended: &Ended| ended.stdout.contains(latest.to_str().unwrap());
     assert!(both.iter().any(is_latest), "{latest:?}");
-    // A start that fails leaves no folder, and one that tracks nothing is not the latest.
+    // A failed start leaves no folder, and a run that tracks nothing does not become the latest.
     let mut failing = command(&rig, &["replay", "tum:/nowhere"]);
     assert_eq!(
         finish({
@@ -317,7 +317,7 @@ fn every_run_has_a_folder_of_its_own_and_the_link_leads_to_the_newest() {
 }
 
 #[test]
-fn a_file_of_the_user_is_never_replaced() {
+fn a_users_file_is_never_replaced() {
     let rig = Rig::new();
     let output = rig.output();
     fs::create_dir(&output).unwrap();
@@ -335,7 +335,7 @@ fn a_file_of_the_user_is_never_replaced() {
 }
 
 #[test]
-fn a_replay_that_is_told_to_stop_writes_what_it_has() {
+fn an_interrupted_replay_writes_its_results_so_far() {
     let rig = Rig::new();
     let output = rig.output();
     let arguments = ["replay", ENDLESS, "--output", output.to_str().unwrap()];

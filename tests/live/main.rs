@@ -1,4 +1,4 @@
-//! The processes as they run: started, killed, stopped, starved, watched, and what they leave behind.
+//! The running processes: started, killed, stopped, starved, watched, and what they leave behind.
 
 #[path = "../support/mod.rs"]
 mod support;

@@ -1,4 +1,4 @@
-//! A running mapper goes over to the map in another folder, and stays in its own where that cannot be used.
+//! A running mapper switches to the map in another folder, and stays in its own if that cannot be used.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -14,10 +14,10 @@ use semidense::slam::map::Map;
 use semidense::wire::port::Hub;
 use semidense::wire::topic::MAPPER_HEALTH;
 
-/// A room that is seen again and again, at the camera's rate, for longer than the tests take on a busy machine: they end it.
+/// A room seen repeatedly, at the camera's rate, for longer than the tests take on a busy machine: they end it.
 const SOURCE: &str = "loop:1000:30:sim";
 
-/// A map of the simulated room, or of what another camera sees of it.
+/// A map of the simulated room, or of another camera's view of it.
 fn make_map(rig: &Rig, name: &str, setting: Option<&str>) -> PathBuf {
     let map = rig.folder().join(name);
     let mut command = rig.command(&["replay", "sim", "--json"]);
@@ -33,7 +33,7 @@ fn make_map(rig: &Rig, name: &str, setting: Option<&str>) -> PathBuf {
     map
 }
 
-/// A run in a map of its own.
+/// A run with its own map.
 struct Running {
     child: Child,
     own: PathBuf,
@@ -54,7 +54,7 @@ impl Running {
         running
     }
 
-    /// Waits until the mapper says that of itself.
+    /// Waits until the mapper's own report starts with `beginning`.
     fn wait_for(&mut self, beginning: &str) {
         until(beginning, || {
             self.mapper.update().ok()?;
@@ -62,7 +62,7 @@ impl Running {
         });
     }
 
-    /// Ends it as from the keyboard.
+    /// Ends it as Ctrl-C does.
     fn stop(self) {
         const INTERRUPTED: i32 = 130;
         signal(&self.child, Signal::INT);
@@ -78,7 +78,7 @@ fn load_map(rig: &Rig, arguments: &[&str], map: &Path) -> Ended {
     finish(command)
 }
 
-/// Ids of the keyframes on the disk.
+/// Ids of the keyframes on disk.
 fn keyframes(map: &Path) -> Vec<u64> {
     let listed = read_manifest(map).map(|(manifest, _)| manifest.keyframes).unwrap_or_default();
     listed.iter().map(|listed| listed.keyframe.keyframe_id).collect()
@@ -99,7 +99,7 @@ fn epochs(map: &Map) -> BTreeSet<u32> {
 }
 
 #[test]
-fn a_running_mapper_goes_on_in_another_map_and_so_does_the_one_after_it() {
+fn a_running_mapper_continues_in_another_map_and_so_does_its_successor() {
     let rig = Rig::new();
     let other = make_map(&rig, "other", None);
     let (before, first_saves) = (keyframes(&other), saves(&other));
@@ -109,10 +109,10 @@ fn a_running_mapper_goes_on_in_another_map_and_so_does_the_one_after_it() {
     let own = whole(&running.own);
     assert!(own.keyframes.iter().all(|keyframe| keyframe.has_depth()), "it was saved first");
     running.wait_for("localised");
-    // The folder that it was in is free: it is a map as any other, and nobody writes it any more.
+    // The previous folder is released: it is an ordinary map, and no process writes to it any more.
     let own_saves = saves(&running.own);
     until("a save in the other map", || (saves(&other) > first_saves).then_some(()));
-    // A mapper that comes after a crash is where the other was.
+    // The successor after a crash continues in the same map.
     let claim = fs::read_to_string(rig.root().join("semidense.mapper.lock")).unwrap();
     let killed: i32 = claim.trim().parse().unwrap();
     kill_process(Pid::from_raw(killed).unwrap(), Signal::KILL).unwrap();
@@ -122,7 +122,7 @@ fn a_running_mapper_goes_on_in_another_map_and_so_does_the_one_after_it() {
     running.stop();
     assert_eq!(saves(&own_folder), own_saves, "the map before was written again");
     assert_eq!(whole(&own_folder).keyframes, own.keyframes);
-    // On the disk the numbers are those that were there, and no keyframe of the run's own map is in it.
+    // On disk the earlier ids are unchanged, and no keyframe of the run's own map is among them.
     let grown = whole(&other);
     let ids = keyframes(&other);
     assert!(before.iter().all(|id| ids.contains(id)), "{before:?} {ids:?}");
@@ -134,7 +134,7 @@ fn a_running_mapper_goes_on_in_another_map_and_so_does_the_one_after_it() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused_in_a_line_and_the_running_map_goes_on() {
+fn maps_that_do_not_fit_are_refused_in_one_line_and_the_running_map_continues() {
     let rig = Rig::new();
     let foreign = make_map(&rig, "foreign", Some("simulator.focal_px=140.0"));
     let newer = make_map(&rig, "newer", None);
@@ -156,7 +156,7 @@ fn what_does_not_fit_is_refused_in_a_line_and_the_running_map_goes_on() {
         (newer.as_path(), "version 200"),
         (damaged.as_path(), "checksum"),
         (nowhere.as_path(), "holds no map"),
-        (running.own.as_path(), "is in"),
+        (running.own.as_path(), "already uses the map"),
     ];
     for (map, expected) in cases {
         for arguments in [&[][..], &["--read-only"]] {

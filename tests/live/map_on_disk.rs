@@ -1,4 +1,4 @@
-//! The map on disk: begun by one process, continued by another, whole after a kill, unchanged where it is only read.
+//! The map on disk: started by one process, continued by another, complete after a kill, unchanged if read-only.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -14,7 +14,7 @@ use semidense::service::trajectory_file::read_trajectory;
 use semidense::slam::map::Map;
 use serde_json::Value;
 
-/// Frames of a run that makes several keyframes.
+/// Frames of a run that creates several keyframes.
 const FRAMES: usize = 150;
 
 /// A command on the small simulated camera, with this map.
@@ -28,14 +28,14 @@ fn with_map(rig: &Rig, command: &str, output: &Path, map: &Path, arguments: &[&s
     command
 }
 
-/// Runs it to a good end; its summary.
+/// Runs a command that must succeed; returns its summary.
 fn done(command: Command) -> Value {
     let ended = finish(command);
     assert!(ended.status.success(), "{}", ended.stderr);
     serde_json::from_str(&ended.stdout).unwrap()
 }
 
-/// Every file of a folder, and what it holds.
+/// Every file of a folder with its content.
 fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder).unwrap().flatten() {
@@ -63,7 +63,7 @@ fn loaded(folder: &Path) -> Map {
 }
 
 #[test]
-fn the_camera_is_found_in_a_map_that_stays_as_it_is() {
+fn the_camera_is_relocalised_in_a_read_only_map() {
     let rig = Rig::new();
     let (map, first, second) =
         (rig.folder().join("map"), rig.folder().join("first"), rig.folder().join("second"));
@@ -75,7 +75,7 @@ fn the_camera_is_found_in_a_map_that_stays_as_it_is() {
     let summary = done(with_map(&rig, "replay", &second, &map, &["--read-only"]));
     assert!(contents(&map) == before, "something in the folder has changed");
     assert_eq!(summary["keyframes"], keyframes.len());
-    // The same frames are where they were; the first pass knew some of them afterwards only.
+    // The same frames are at the same poses; the first pass knew some of them only afterwards.
     let truth = read_trajectory(&first.join("trajectory.txt")).unwrap();
     let found = read_trajectory(&second.join("trajectory.txt")).unwrap();
     assert!(found.len() > FRAMES * 9 / 10, "{} frames", found.len());
@@ -100,7 +100,7 @@ fn the_camera_is_found_in_a_map_that_stays_as_it_is() {
 }
 
 #[test]
-fn the_next_run_goes_on_in_the_same_epoch_and_lockstep_gives_the_same_bits() {
+fn the_next_run_continues_in_the_same_epoch_and_lockstep_gives_the_same_bits() {
     let rig = Rig::new();
     let at = |name: &str| rig.folder().join(name);
     done(with_map(&rig, "replay", &at("first"), &at("map"), &["--frames", "80"]));
@@ -121,14 +121,14 @@ fn the_next_run_goes_on_in_the_same_epoch_and_lockstep_gives_the_same_bits() {
 }
 
 #[test]
-fn a_kill_at_any_instant_leaves_a_whole_map_at_most_a_keyframe_old() {
+fn a_kill_at_any_instant_leaves_a_complete_map_at_most_a_keyframe_old() {
     let rig = Rig::new();
     let (map, output) = (rig.folder().join("map"), rig.folder().join("output"));
     let (mut saves, mut has_run) = (0, false);
     for trial in 0..12u64 {
         let mut child = with_map(&rig, "replay", &output, &map, &[]).spawn().unwrap();
-        // The first before any keyframe, the others so many saves later, and so long after that, which meets every part
-        // of the next one.
+        // The first kill is before any keyframe, each other one a given number of saves and then a delay later, which
+        // meets every part of the next save.
         let wanted = saves + trial % 4 + u64::from(trial > 0);
         let wait = Duration::from_millis(trial * 37 % 60);
         let begin = Instant::now();
@@ -151,7 +151,7 @@ fn a_kill_at_any_instant_leaves_a_whole_map_at_most_a_keyframe_old() {
                 has_run = true;
                 let made = made.map_or(0, |of| of.map(&journal[0].folder, 1 << 30).keyframes.len());
                 let kept = loaded.map.keyframes.len();
-                // One is being observed, and one may be on its way.
+                // One is being observed, and one may be in transit.
                 assert!(kept + 2 >= made, "trial {trial}: {kept} of {made} keyframes");
                 assert!(loaded.map.keyframes.iter().all(|of| of.has_depth()), "trial {trial}");
             }
@@ -167,7 +167,7 @@ fn a_kill_at_any_instant_leaves_a_whole_map_at_most_a_keyframe_old() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused_in_a_line() {
+fn maps_that_do_not_fit_are_refused_in_one_line() {
     let rig = Rig::new();
     let (map, output) = (rig.folder().join("map"), rig.folder().join("output"));
     done(with_map(&rig, "replay", &output, &map, &["--frames", "60"]));
@@ -180,7 +180,7 @@ fn what_does_not_fit_is_refused_in_a_line() {
     };
     let other = refused(&["--set", "simulator.focal_px=140.0"], &map);
     assert!(other.contains("another camera") && other.contains("140"), "{other}");
-    // A run says so before it starts anything.
+    // A run reports this before it starts anything.
     let never = rig.folder().join("never");
     let ended = finish(with_map(&rig, "run", &never, &map, &["--set", "simulator.focal_px=140.0"]));
     assert_eq!(ended.status.code(), Some(1), "{}", ended.stderr);
@@ -237,7 +237,7 @@ fn a_map_is_described_exported_and_merged() {
     let both = loaded(&at("both"));
     let epochs: BTreeSet<u32> = both.keyframes.iter().map(|keyframe| keyframe.epoch).collect();
     assert_eq!((both.keyframes.len(), epochs.len()), (2 * keyframes, 2));
-    // One file is damaged: it is named, and everything else is there.
+    // One file is damaged: it is named, and everything else is intact.
     let file = contents(&at("map/keyframes"))[0].0.clone();
     fs::write(&file, "semidense").unwrap();
     let info = map(&["info", "map"]);
@@ -247,7 +247,7 @@ fn a_map_is_described_exported_and_merged() {
 }
 
 #[test]
-fn a_running_mapper_saves_when_it_is_asked() {
+fn a_running_mapper_saves_on_request() {
     let rig = Rig::new();
     let map = rig.folder().join("map");
     let source = "loop:1000000:30:sim";

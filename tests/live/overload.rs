@@ -1,5 +1,5 @@
-//! A tracker whose frames come faster than it can track them: there is never a pause between two frames, and
-//! yet it reports how it is (its watchdog lives on that) and ends when it is asked to.
+//! A tracker whose frames arrive faster than it can track them: there is never a pause between two frames, yet it
+//! reports its health (on which its watchdog depends) and ends when asked to.
 
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
@@ -16,15 +16,15 @@ use semidense::wire::topic::{FRAME, KEYFRAME, KEYFRAME_IMAGE, TRACKER_HEALTH};
 
 use crate::waves::{CAMERA, header, keyframe};
 
-/// Reports that are waited for.
+/// Number of reports to wait for.
 const REPORTS: usize = 40;
-/// Most frames from one report to the next that was heard. With every frame of a flood others are dropped, which is
-/// reported within 10 ms; a frame that is searched for everywhere takes some of them.
+/// Upper limit for the frames between two received reports. With every frame of a flood others are dropped, which is
+/// reported within 10 ms; a frame for which every view is searched takes some of them.
 const MOST_FRAMES_BETWEEN: u64 = 60;
-/// Far above anything that is expected: it ends a test that hangs.
+/// Far above any expected duration: it ends a test that hangs.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Sends frames without a pause until somebody says that it is enough.
+/// Sends frames without a pause until told to stop.
 fn flood(place: &Place, enough: &Receiver<()>) {
     let hub = Hub::join(place, "others", Access::Member).unwrap();
     let keyframe = keyframe(0);
@@ -33,7 +33,7 @@ fn flood(place: &Place, enough: &Receiver<()>) {
     images.send(keyframe_image_header(&keyframe), &keyframe.image).unwrap();
     depths.send(keyframe_header(&keyframe), &keyframe.points).unwrap();
     let frames = hub.publisher(&FRAME, CAMERA.width * CAMERA.height).unwrap();
-    // Nothing of the keyframe: each is searched for from every view, which takes much longer than to send it.
+    // Unlike the keyframe: for each frame every view is searched, which takes much longer than sending it.
     let stripes: Vec<u8> = (0..CAMERA.width * CAMERA.height)
         .map(|i| if (i % CAMERA.width / 7).is_multiple_of(2) { 20 } else { 230 })
         .collect();
@@ -47,13 +47,13 @@ fn flood(place: &Place, enough: &Receiver<()>) {
     }
 }
 
-/// Frames that the tracker had counted at each of its reports, once it was lost.
+/// The tracker's frame count in each of its reports once it was lost.
 fn hear(health: &Subscriber<HealthMessage, ()>) -> Vec<u64> {
     let (mut told, start) = (Vec::new(), Instant::now());
     while told.len() < REPORTS && start.elapsed() < PATIENCE {
         while let Some(message) = health.receive().unwrap() {
             let report = message.payload()[0];
-            // 3 is "lost": before the keyframe is there, there is hardly any work in a frame.
+            // 3 is "lost": before the keyframe arrives, a frame takes hardly any work.
             told.extend((report.detail == 3).then_some(report.frames));
         }
         std::thread::sleep(Duration::from_millis(2));

@@ -26,7 +26,7 @@ use semidense::wire::topic::{
 };
 use serde_json::Value;
 
-/// A live run that lasts a minute if nobody ends it.
+/// A live run that lasts a minute unless ended.
 const SLOW: &[&str] = &["--live", "--set", "simulator.rate_hz=8"];
 const SLOW_FRAMES: usize = 480;
 
@@ -38,7 +38,7 @@ fn summary(rig: &Rig) -> Value {
 /// Frames of the runs that are compared bit for bit.
 const FRAMES: usize = 25;
 
-/// Runs in lockstep and gives every pose as an observer sees it, without the times.
+/// Runs in lockstep and returns every pose seen by an observer, without the times.
 fn observed_poses(rig: &Rig, arguments: &[&str]) -> BTreeMap<u64, String> {
     let child = rig.run(FRAMES, arguments).spawn().unwrap();
     let hub = rig.observe();
@@ -47,7 +47,7 @@ fn observed_poses(rig: &Rig, arguments: &[&str]) -> BTreeMap<u64, String> {
     until("the last frame", || {
         while let Some(message) = poses.receive().unwrap() {
             let pose = pose_from_message(&message.payload()[0]).unwrap();
-            // Floating point prints its shortest exact form: equal texts are equal bits.
+            // Floating-point numbers print in their shortest exact form: equal texts are equal bits.
             seen.insert(pose.sequence, format!("{pose:?}"));
         }
         seen.contains_key(&(FRAMES as u64 - 1)).then_some(())
@@ -59,7 +59,7 @@ fn observed_poses(rig: &Rig, arguments: &[&str]) -> BTreeMap<u64, String> {
 }
 
 #[test]
-fn a_run_ends_by_itself_writes_its_results_and_leaves_nothing() {
+fn a_run_ends_on_its_own_writes_its_results_and_leaves_nothing_behind() {
     let rig = Rig::new();
     let ended = finish(rig.run(20, &[]));
     assert!(ended.status.success(), "{}", ended.stderr);
@@ -73,7 +73,7 @@ fn a_run_ends_by_itself_writes_its_results_and_leaves_nothing() {
     assert_eq!(summary["frames_in"], 20);
     assert_eq!(summary["frames_dropped"], 0);
     assert!(summary["track_ms"]["p50"].is_number() && summary["map_ms"]["p50"].is_number());
-    // Two come with the start.
+    // Two are part of the start.
     let has_changed = summary["keyframes"].as_u64().unwrap() > 2;
     for time in ["keyframe_ms", "keyframe_step_ms"] {
         assert_eq!(summary[time]["p50"].is_number(), has_changed, "{time}");
@@ -100,7 +100,7 @@ fn replayed_poses() -> BTreeMap<u64, String> {
 }
 
 #[test]
-fn lockstep_gives_the_bits_of_replay_with_any_number_of_threads() {
+fn lockstep_gives_the_same_bits_as_replay_with_any_number_of_threads() {
     let (one, other) = (Rig::new(), Rig::new());
     let first = observed_poses(&one, &["--set", "mapper.threads=1"]);
     let second = observed_poses(&other, &["--set", "mapper.threads=3"]);
@@ -113,7 +113,7 @@ fn lockstep_gives_the_bits_of_replay_with_any_number_of_threads() {
 }
 
 #[test]
-fn a_pose_has_the_real_time_of_its_frame() {
+fn a_pose_carries_the_real_time_of_its_frame() {
     let rig = Rig::new();
     let since_1970 = || UNIX_EPOCH.elapsed().unwrap().as_nanos() as i64;
     let begin = since_1970();
@@ -133,7 +133,7 @@ fn a_pose_has_the_real_time_of_its_frame() {
             let Some(header) = sent.get(&pose.sequence) else { continue };
             assert_eq!(pose.realtime_nanos, header.realtime_nanos);
             assert!((begin..=since_1970()).contains(&pose.realtime_nanos));
-            // Both clocks advance alike, but for what the system clock is slewed by.
+            // Both clocks advance alike, except for the slewing of the system clock.
             let offset = header.realtime_nanos - header.clock_nanos;
             let drift = before.replace(offset).map_or(0, |before: i64| (before - offset).abs());
             assert!(drift < 5_000_000, "{drift} ns");
@@ -147,7 +147,7 @@ fn a_pose_has_the_real_time_of_its_frame() {
 }
 
 #[test]
-fn who_comes_late_gets_the_keyframe_and_status_sees_all_three() {
+fn a_late_subscriber_receives_the_keyframe_and_status_shows_all_three_processes() {
     let rig = Rig::new();
     let child = rig.run(SLOW_FRAMES, SLOW).spawn().unwrap();
     let hub = rig.observe();
@@ -161,7 +161,7 @@ fn who_comes_late_gets_the_keyframe_and_status_sees_all_three() {
     let keyframe = until("the keyframe", || inbox.newest().unwrap());
     assert_eq!(keyframe.image.len(), 160 * 120);
 
-    // What a process tells once a second may be of before.
+    // A process reports once a second, so its report may be outdated.
     let status = until("the figures of all three", || {
         let status = finish(rig.command(&["status", "--once", "--json"]));
         assert!(status.status.success(), "{}", status.stderr);
@@ -197,7 +197,7 @@ fn who_comes_late_gets_the_keyframe_and_status_sees_all_three() {
 }
 
 #[test]
-fn a_killed_tracker_comes_back() {
+fn a_killed_tracker_is_restarted() {
     let rig = Rig::new();
     let child = rig.run(60, SLOW).spawn().unwrap();
     let hub = rig.observe();
@@ -233,7 +233,7 @@ fn nothing_outlives_a_killed_supervisor() {
         let pid = Pid::from_raw(i32::try_from(pid).unwrap()).unwrap();
         until("the end of a child", || rustix::process::test_kill_process(pid).err());
     }
-    // The last of them clears up, its supervisor's claim as well; what is left says where the journal is.
+    // The last of them cleans up, including its supervisor's claim; what is left points to the journal.
     let leftovers = rig.leftovers();
     assert!(leftovers.len() == 1 && leftovers[0].ends_with(".journal"), "{leftovers:?}");
 }
@@ -248,7 +248,7 @@ fn process_ids(hub: &Hub) -> Vec<u32> {
     ids
 }
 
-/// Exactly one line says what is wrong, and nobody panicked.
+/// Checks that exactly one line describes the error, and nothing panicked.
 fn assert_one_error(stderr: &str, expected: &str) {
     let errors: Vec<_> = stderr.lines().filter(|line| line.starts_with("error: ")).collect();
     assert_eq!(errors.len(), 1, "{stderr}");
@@ -257,7 +257,7 @@ fn assert_one_error(stderr: &str, expected: &str) {
 }
 
 #[test]
-fn bad_input_gives_one_line_and_leaves_nothing() {
+fn bad_input_gives_one_line_and_leaves_nothing_behind() {
     let rig = Rig::new();
     let file = rig.folder().join("file");
     fs::write(&file, "x").unwrap();
@@ -316,7 +316,7 @@ fn broken_recording(rig: &Rig) -> String {
 }
 
 #[test]
-fn status_sees_who_runs_without_capture() {
+fn status_shows_the_running_processes_without_capture() {
     let rig = Rig::new();
     let tracker = rig.command(&["tracker", "--live"]).spawn().unwrap();
     let status = until("status of a tracker alone", || {
@@ -347,9 +347,9 @@ fn status_sees_who_runs_without_capture() {
     assert_eq!(nobody.status.code(), Some(1), "{}", nobody.stdout);
 }
 
-/// A reader that came late, or whose keyframe was corrected since, asks for the depth of any keyframe of the graph.
+/// A late reader, or one whose keyframe has been corrected since, requests the depth of a keyframe in the graph.
 #[test]
-fn depth_of_an_earlier_keyframe_comes_on_request() {
+fn depth_of_an_earlier_keyframe_is_sent_on_request() {
     let rig = Rig::new();
     let child = rig.run(2000, &["--live"]).spawn().unwrap();
     let hub = rig.observe();

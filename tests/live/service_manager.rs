@@ -1,4 +1,4 @@
-//! What the service manager hears of the three processes: READY, STATUS, and WATCHDOG from the frame loop
+//! Notifications of the three processes to the service manager: READY, STATUS, and WATCHDOG from the frame loop
 //! itself. The manager is a socket of the test.
 
 use std::io::ErrorKind;
@@ -9,12 +9,12 @@ use crate::support::{Rig, WATCH_DOG, finish, signal, small_camera, until};
 use rustix::process::Signal;
 use semidense::wire::command::{Command, CommandClient};
 
-/// Time between two heartbeats that the manager allows: loops wake ten times in a second.
+/// Time that the manager allows between two heartbeats: loops wake ten times a second.
 const WATCHDOG_US: &str = "800000";
-/// Heartbeats that are waited for.
+/// Number of heartbeats to wait for.
 const BEATS: usize = 5;
 
-/// The manager of one process, and what it has heard.
+/// The manager of one process, and the messages it has received.
 struct Manager {
     socket: UnixDatagram,
     heard: Vec<String>,
@@ -22,7 +22,7 @@ struct Manager {
 }
 
 impl Manager {
-    /// Starts a process as a manager would.
+    /// Starts a process as a service manager would.
     fn start(rig: &Rig, arguments: &[&str]) -> Self {
         let path = rig.folder().join(format!("{}.notify", arguments[0]));
         let socket = UnixDatagram::bind(&path).unwrap();
@@ -46,7 +46,7 @@ impl Manager {
         }
     }
 
-    /// Until something that was heard from the message `from` on is so.
+    /// Waits until a message received from the index `from` on satisfies `is`.
     fn until_heard(&mut self, from: usize, what: &str, is: impl Fn(&str) -> bool) {
         until(what, || {
             self.listen();
@@ -70,7 +70,7 @@ impl Manager {
         self.heard.iter().any(|heard| heard == message)
     }
 
-    /// Ends it, and listens until it has ended: a socket holds few messages.
+    /// Ends the process, and listens until it has ended: a socket holds few messages.
     fn stop(mut self) -> Vec<String> {
         self.listen();
         signal(&self.child, Signal::TERM);
@@ -84,14 +84,14 @@ impl Manager {
 }
 
 #[test]
-fn all_three_are_ready_say_what_they_do_and_beat_while_a_source_stalls() {
+fn all_three_report_ready_and_their_state_and_beat_while_a_source_stalls() {
     let rig = Rig::new();
     let mut tracker = Manager::start(&rig, &["tracker", "--live"]);
     let mut mapper = Manager::start(&rig, &["mapper", "--live"]);
     for waiting in [&mut tracker, &mut mapper] {
         waiting.until_heard(0, "READY", |message| message == "READY=1");
         waiting.until_heard(0, "a status", |message| message.starts_with("STATUS=ready"));
-        // Nobody sends a frame.
+        // No process sends a frame.
         waiting.until_beats(BEATS);
     }
     let source = ["capture", "--live", "--source", "loop:1000000:20:sim"];
@@ -107,7 +107,7 @@ fn all_three_are_ready_say_what_they_do_and_beat_while_a_source_stalls() {
     let beat = capture.heard.iter().rposition(|message| message == "WATCHDOG=1").unwrap();
     assert!(ready < beat, "{:?}", capture.heard);
 
-    // A source that stalls: its readers say so and live on, and what hangs does not beat.
+    // A stalled source: its readers report it and live on; the hanging process does not beat.
     signal(&capture.child, Signal::STOP);
     for reader in [&mut tracker, &mut mapper] {
         let from = reader.heard.len();
@@ -133,7 +133,7 @@ fn all_three_are_ready_say_what_they_do_and_beat_while_a_source_stalls() {
 }
 
 #[test]
-fn the_children_of_a_supervisor_leave_its_manager_alone() {
+fn the_children_of_a_supervisor_do_not_notify_its_manager() {
     let rig = Rig::new();
     let path = rig.folder().join("run.notify");
     let socket = UnixDatagram::bind(&path).unwrap();
@@ -147,7 +147,7 @@ fn the_children_of_a_supervisor_leave_its_manager_alone() {
 }
 
 #[test]
-fn a_mapper_that_has_written_its_map_does_again_what_it_did() {
+fn a_mapper_that_has_written_its_map_reports_its_usual_state_again() {
     let rig = Rig::new();
     let mut mapper = Manager::start(&rig, &["mapper", "--live"]);
     mapper.until_heard(0, "a status", |message| message.starts_with("STATUS=ready ("));

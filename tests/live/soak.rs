@@ -1,6 +1,6 @@
-//! Processes that are killed at any instant, alone, in pairs and all three, on two rigs side by side: the others
-//! carry on, those started again continue, and nothing stays behind. A few kills always; a thousand by
-//! `cargo test --release --test live soak -- --ignored --nocapture`.
+//! Processes killed at any instant, alone, in pairs and all three, on two rigs side by side: the others carry on,
+//! restarted ones continue, and nothing is left behind. A few kills in every run; a thousand with `cargo test
+//! --release --test live soak -- --ignored --nocapture`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
@@ -25,29 +25,29 @@ use semidense::wire::port::{Access, Hub, Subscriber};
 use semidense::wire::topic::{HEALTH_TOPICS, POSE};
 use serde_json::Value;
 
-/// Kills on each rig that every run of the tests makes.
+/// Kills on each rig in every run of the tests.
 const FEW_KILLS: usize = 10;
 /// Kills on each rig of the long run.
 const MANY_KILLS: usize = 500;
-/// Of the long run: so many of the kills whose processes had all lived long enough bring poses back in time.
+/// In the long run: share of the kills of processes that had all lived long enough after which poses resume in time.
 const IN_TIME_RATIO: f64 = 0.99;
-/// In time.
+/// Upper limit for a gap in the poses that counts as in time.
 const WITHOUT_POSES: Duration = Duration::from_secs(1);
-/// What the supervisor may keep of a frame until the end, bytes: times. Its pose is in the journal.
+/// Upper limit for the bytes that the supervisor may keep of a frame until the end: times. Its pose is in the journal.
 const BYTES_OF_A_FRAME: f64 = 100.0;
-/// The camera moves slowly back and forth: within the second that a restart may take it goes less than this
-/// between two poses, in units of the map (about a room's depth).
+/// The camera moves slowly back and forth: within the second that a restart may take it moves less than this between
+/// two poses, in map units (about a room's depth).
 const LARGEST_STEP: f64 = 0.5;
-/// Who dies sooner after its start is started again later and later.
+/// A process that dies sooner after its start is restarted with a growing delay.
 const HASTY: Duration = Duration::from_secs(2);
-/// Files that have not changed for so long are counted.
+/// Files are counted once unchanged for this long.
 const SETTLED: Duration = Duration::from_secs(2);
-/// Keyframes that a mapper keeps for its successor; one more while it writes.
+/// Keyframes that a mapper keeps for its successor, plus one while it writes.
 const MOST_KEPT_KEYFRAMES: usize = 21;
-/// Memory that a process may take more than at the beginning: pages of other code, a fuller map.
+/// Factor on the initial memory of a process that it may reach: pages of other code, a fuller map.
 const MEMORY_SLACK: f64 = 1.5;
 
-/// Numbers that are the same on every run (xorshift64).
+/// Pseudo-random numbers, the same on every run (xorshift64).
 struct Dice(u64);
 
 impl Dice {
@@ -59,7 +59,7 @@ impl Dice {
     }
 }
 
-/// Poses as an observer sees them, and what must hold of each.
+/// Poses as seen by an observer, and the checks of each.
 struct Watch {
     poses: Subscriber<PoseMessage, ()>,
     last: Option<PoseEstimate>,
@@ -83,7 +83,7 @@ impl Watch {
 
     fn take(&mut self, pose: PoseEstimate) {
         if let Some(last) = &self.last {
-            // A pose that a dead tracker has sent may come with the history of its successor again.
+            // A pose sent by a dead tracker may be repeated with the history of its successor.
             assert!(pose.sequence >= last.sequence, "{} after {}", pose.sequence, last.sequence);
             let (stamp, before) = (pose.capture_nanos, last.capture_nanos);
             assert!(stamp > before || pose.sequence == last.sequence, "{stamp} after {before}");
@@ -93,7 +93,7 @@ impl Watch {
             self.epochs.insert(pose.epoch);
             if let Some(last) = self.last_tracked.filter(|last| last.epoch == pose.epoch) {
                 let step = distance(&last.world_from_camera, &pose.world_from_camera);
-                // Who was away for longer has gone farther.
+                // After a longer gap the camera may have moved farther.
                 let secs = (pose.capture_nanos - last.capture_nanos) as f64 * 1e-9;
                 assert!(
                     step < LARGEST_STEP * secs.max(1.0),
@@ -107,7 +107,7 @@ impl Watch {
         self.last = Some(pose);
     }
 
-    /// Until a pose is claimed of a frame that is newer than all so far.
+    /// Waits for three more claimed poses; returns how long that took.
     fn until_resumed(&mut self, what: &str) -> Duration {
         let start = Instant::now();
         let before = self.count;
@@ -119,7 +119,7 @@ impl Watch {
     }
 }
 
-/// What of a pose tells why it is where it is.
+/// The properties of a pose that explain its value.
 fn described(pose: &PoseEstimate) -> String {
     let (quality, place) = (&pose.quality, pose.world_from_camera.translation);
     format!(
@@ -140,8 +140,7 @@ fn distance(one: &SE3, other: &SE3) -> f64 {
     (one.translation - other.translation).norm()
 }
 
-/// How many files of each kind there are in shared memory and in the folder: the names themselves differ with
-/// every process.
+/// Number of files of each kind in shared memory and in the folder: the names themselves differ with every process.
 fn files(rig: &Rig) -> BTreeMap<String, usize> {
     let prefix = rig.place().prefix;
     let names = |folder: &Path| {
@@ -153,7 +152,7 @@ fn files(rig: &Rig) -> BTreeMap<String, usize> {
     let mut keyframes = 0;
     for name in shared.chain(names(&rig.root())) {
         let kind = name.rsplit('.').next().unwrap_or_default().to_owned();
-        // What a mapper keeps of the keyframes before the active one, `NAME.checkpoint.ID`.
+        // The keyframes before the active one that a mapper keeps, `NAME.checkpoint.ID`.
         match kind.parse::<u64>() {
             Ok(_) => keyframes += 1,
             Err(_) => *counts.entry(kind).or_default() += 1,
@@ -163,8 +162,8 @@ fn files(rig: &Rig) -> BTreeMap<String, usize> {
     counts
 }
 
-/// The files once nothing comes or goes any more: a process that has just started still makes some, and what the
-/// dead left is removed a little later.
+/// The files once nothing changes any more: a process that has just started still creates some, and the remains of
+/// dead ones are removed a little later.
 fn settled_files(rig: &Rig, watch: &mut Watch) -> BTreeMap<String, usize> {
     let mut last = files(rig);
     let mut since = Instant::now();
@@ -183,7 +182,7 @@ fn has_no_more(now: &BTreeMap<String, usize>, before: &BTreeMap<String, usize>) 
     now.iter().all(|(kind, count)| before.get(kind).is_some_and(|most| count <= most))
 }
 
-/// Shared memory that is taken, bytes.
+/// Shared memory in use, bytes.
 fn shared_bytes(rig: &Rig) -> f64 {
     let prefix = rig.place().prefix;
     let entries = fs::read_dir(SHARED_MEMORY).unwrap().flatten();
@@ -202,10 +201,10 @@ fn pid_of(peer: &mut Peer) -> u32 {
     until("a process id", || peer.update().unwrap().map(|health| health.process_id))
 }
 
-/// Every choice of at least one process, by their indices in [`HEALTH_TOPICS`].
+/// Every non-empty subset of the processes, by their indices in [`HEALTH_TOPICS`].
 const VICTIMS: [&[usize]; 7] = [&[0], &[1], &[2], &[0, 1], &[0, 2], &[1, 2], &[0, 1, 2]];
 
-/// One of the rigs: its run and what an observer sees of it.
+/// One of the rigs: its run as seen by an observer.
 struct Rigged {
     run: Child,
     output: PathBuf,
@@ -217,15 +216,15 @@ struct Rigged {
 impl Rigged {
     fn start(rig: &Rig, name: &str) -> Self {
         let output = rig.folder().join(name);
-        // The dice kill the same process again within two seconds of its start, six times in a row if they are
-        // thrown often enough: no reason to give up here.
+        // With enough draws, the same process is killed again within two seconds of its start six times in a row: no
+        // reason to give up here.
         let mut command = rig.command(&["run", "--output", output.to_str().unwrap()]);
         for setting in small_camera(60) {
             command.args(["--set", &format!("simulator.{setting}")]);
         }
         command.args(["--live", "--source", "loop:1000000:30:sim", "--instance", name]);
         command.args(["--set", "supervisor.max_restarts=1000"]);
-        // A file is never full: many restarts say much.
+        // A file never fills up as a pipe would: many restarts print a lot.
         command.stderr(File::create(Self::said(&output)).unwrap());
         let run = command.spawn().unwrap();
         let place = Place::new(name, rig.root().to_str().unwrap()).unwrap();
@@ -237,7 +236,7 @@ impl Rigged {
         Self { run, output, watch, peers, began: [Instant::now(); 3] }
     }
 
-    /// What the run writes on standard error.
+    /// File with the run's standard error.
     fn said(output: &Path) -> PathBuf {
         output.with_extension("stderr")
     }
@@ -255,12 +254,12 @@ impl Rigged {
         }
     }
 
-    /// Kills processes at the same time and checks that poses resume; how long they were missing.
+    /// Kills processes simultaneously and checks that poses resume; returns how long they were missing.
     fn kill(&mut self, victims: &[usize]) -> Pause {
         let has_lived = victims.iter().all(|&index| self.began[index].elapsed() > HASTY);
         let pids: Vec<u32> = victims.iter().map(|&index| pid_of(&mut self.peers[index])).collect();
         for &pid in &pids {
-            // One that its back-off has just replaced is another process by now.
+            // A process that its back-off has just replaced has another id by now.
             let _ = kill_process(Pid::from_raw(pid as i32).unwrap(), Signal::KILL);
         }
         let begin = Instant::now();
@@ -276,18 +275,18 @@ impl Rigged {
         Pause { victims: what, missing: begin.elapsed(), has_lived }
     }
 
-    /// Resident memory of the supervisor and of the three, bytes.
+    /// Resident memory of the supervisor and of the three processes, bytes.
     fn memory(&mut self) -> [f64; 2] {
         let peers = self.peers.iter_mut().map(|peer| resident(pid_of(peer)).unwrap_or(0.0));
         [resident(self.run.id()).unwrap(), peers.sum()]
     }
 
-    /// Kills as often at random instants, and looks after each that all continues.
+    /// Kills at `kills` random instants, and checks after each that everything continues.
     fn soak(&mut self, kills: usize, seed: u64) -> Vec<Pause> {
         let mut dice = Dice(seed);
         let mut pauses = Vec::new();
         for _ in 0..kills {
-            // One in four waits until whoever is hit has lived long enough to be started again at once.
+            // One in four waits until the victims have lived long enough to be restarted at once.
             let millis = dice.below(400) + if dice.below(4) == 0 { 2100 } else { 0 };
             self.wait(Duration::from_millis(millis));
             pauses.push(self.kill(VICTIMS[dice.below(VICTIMS.len() as u64) as usize]));
@@ -295,7 +294,7 @@ impl Rigged {
         pauses
     }
 
-    /// Ends the run; the summary holds what died processes had counted.
+    /// Ends the run; the summary includes the counts of processes that died.
     fn end(self) {
         let (run, output, epochs) = (self.run, self.output, self.watch.epochs.clone());
         drop((self.peers, self.watch));
@@ -307,7 +306,7 @@ impl Rigged {
         let summary: Value = serde_json::from_str(&summary).unwrap();
         let of = |name: &str| summary[name].as_u64().unwrap();
         assert!(of("frames_in") >= of("frames_tracked") + of("frames_initializing"), "{summary}");
-        // Epochs that were joined are one in the end: those that count are those of the file.
+        // Joined epochs are one at the end: the epochs in the file count.
         let trajectory = fs::read_to_string(output.join("trajectory.txt")).unwrap();
         let marks = trajectory.lines().filter(|line| line.starts_with("# epoch "));
         let written = marks.collect::<BTreeSet<_>>().len().max(1);
@@ -316,7 +315,7 @@ impl Rigged {
     }
 }
 
-/// Where the two rigs wait for each other; one that fails does not keep the other waiting.
+/// Where the two rigs wait for each other; a failed one does not keep the other waiting.
 #[derive(Default)]
 struct Meeting(AtomicUsize);
 
@@ -343,14 +342,14 @@ impl Drop for Leaves<'_> {
     }
 }
 
-/// Two rigs of one folder side by side, as many kills on each; the pauses of both.
+/// Two rigs in one folder side by side, `kills` kills on each; returns the pauses of both.
 fn soak(kills: usize, seed: u64) -> Vec<Pause> {
     let rig = Rig::new();
     let meeting = Meeting::default();
     let soak_one = |name: &str, seed: u64| {
         let _leaves = Leaves(&meeting);
         let mut rigged = Rigged::start(&rig, name);
-        // Who is connected to whom depends on who started last: each once in a known order, then and at the end.
+        // Connections depend on which process started last: kill each once in a known order, now and at the end.
         let in_order = |rigged: &mut Rigged| (0..3).for_each(|index| drop(rigged.kill(&[index])));
         in_order(&mut rigged);
         meeting.wait(2, &mut rigged.watch);
@@ -402,11 +401,11 @@ fn soak(kills: usize, seed: u64) -> Vec<Pause> {
     pauses
 }
 
-/// How long poses were missing after a kill.
+/// Gap in the poses after a kill.
 struct Pause {
     victims: String,
     missing: Duration,
-    /// Whether all who were killed had lived long enough to be started again at once.
+    /// Whether all victims had lived long enough to be restarted at once.
     has_lived: bool,
 }
 
@@ -415,7 +414,7 @@ fn say(line: &str) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }
 
-/// Says how long poses were missing, of pauses in their order.
+/// Prints how long poses were missing, in the order of the pauses.
 fn report(pauses: &[Pause]) {
     let figures = |what: &str, chosen: &dyn Fn(&&Pause) -> bool| {
         let times: Vec<f64> =
@@ -440,7 +439,7 @@ fn report(pauses: &[Pause]) {
 }
 
 #[test]
-fn a_source_that_stalls_is_said_and_recovers_alone() {
+fn a_stalled_source_is_reported_and_recovers_on_its_own() {
     let rig = Rig::new();
     let child = rig.run(60, &["--live", "--source", "loop:1000000:20:sim"]).spawn().unwrap();
     let hub = rig.observe();

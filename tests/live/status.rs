@@ -9,7 +9,7 @@ use crate::support::{Rig, WATCH_DOG, end, finish, signal};
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// The lines of a child's standard output as they come.
+/// The lines of a child's standard output as they arrive.
 fn lines(child: &mut Child) -> Receiver<String> {
     let stdout = BufReader::new(child.stdout.take().unwrap());
     let (tell, told) = channel();
@@ -24,7 +24,7 @@ fn next(lines: &Receiver<String>) -> Value {
     serde_json::from_str(&line).unwrap_or_else(|error| panic!("{error}: {line}"))
 }
 
-/// The first object that is as it should be.
+/// The first object that satisfies `is_right`.
 fn until(lines: &Receiver<String>, is_right: impl Fn(&Value) -> bool) -> Value {
     let begin = Instant::now();
     loop {
@@ -37,7 +37,7 @@ fn until(lines: &Receiver<String>, is_right: impl Fn(&Value) -> bool) -> Value {
 }
 
 #[test]
-fn watching_goes_on_through_the_ends_of_runs_with_an_object_a_line() {
+fn watching_continues_past_the_ends_of_runs_with_an_object_per_line() {
     let rig = Rig::new();
     let mut watch = rig.command(&["status", "--watch", "--json"]).spawn().unwrap();
     let said = lines(&mut watch);
@@ -59,7 +59,7 @@ fn watching_goes_on_through_the_ends_of_runs_with_an_object_a_line() {
 }
 
 #[test]
-fn watching_says_in_words_that_nothing_runs() {
+fn watching_reports_as_text_that_nothing_runs() {
     let rig = Rig::new();
     let mut watch = rig.command(&["status", "--watch"]).spawn().unwrap();
     let said = lines(&mut watch);

@@ -1,4 +1,4 @@
-//! What a supervised run makes of processes that die together, hang, or lose their memory, and of signals to
+//! How a supervised run deals with processes that die together, hang, or lose their memory, and with signals to
 //! itself.
 
 use std::collections::BTreeMap;
@@ -25,7 +25,7 @@ const CAPTURE: usize = 0;
 const TRACKER: usize = 1;
 const MAPPER: usize = 2;
 
-/// A live run of ten seconds and its processes as an observer sees them.
+/// A live run of ten seconds and its processes as seen by an observer.
 struct Live {
     rig: Rig,
     run: Child,
@@ -76,7 +76,7 @@ impl Live {
         });
     }
 
-    /// Waits for the end; exit code, standard error and the summary.
+    /// Waits for the end; returns exit code, standard error and the summary.
     fn end(self) -> (Option<i32>, String, Value, Rig) {
         drop((self.peers, self.hub));
         let ended = end(self.run);
@@ -88,14 +88,14 @@ impl Live {
     }
 }
 
-/// Stamps of the poses as they were published, in the order of the file.
+/// Stamps of the poses as published, in the order of the file.
 fn stamps(rig: &Rig) -> Vec<f64> {
     let text = fs::read_to_string(rig.output().join("trajectory_online.txt")).unwrap();
     let poses = text.lines().filter(|line| !line.starts_with('#'));
     poses.map(|line| line.split_whitespace().next().unwrap().parse().unwrap()).collect()
 }
 
-/// Whoever dies, the source continues where it was: no frame comes twice and no stamp goes back.
+/// Whichever processes die, the source continues from its position: no frame is repeated and no stamp decreases.
 fn kills_do_not_rewind(processes: &[usize]) {
     let mut live = Live::start(&[]);
     live.until_frames(TRACKER, 90);
@@ -111,16 +111,16 @@ fn kills_do_not_rewind(processes: &[usize]) {
         assert_eq!(summary["restarts_by_process"][HEALTH_TOPICS[process].owner], 1, "{summary}");
     }
     assert!(summary["restart_causes"][0]["cause"].as_str().unwrap().contains("SIGKILL"));
-    // All were sent, but for those that a process that dies had in its hands.
+    // All were sent, except for those that a dying process was handling.
     let frames_in = summary["frames_in"].as_u64().unwrap();
     assert!((FRAMES - 2..=FRAMES).contains(&frames_in), "{summary}");
 }
 
-/// Nearly all of such a run is waiting: several together take no longer than one.
+/// Such runs mostly wait: several together take no longer than one.
 fn at_once(scenarios: &[(&str, &(dyn Fn() + Sync))]) {
     std::thread::scope(|scope| {
         for (name, run) in scenarios {
-            // A panic says the name of its thread.
+            // A panic prints the name of its thread.
             let thread = std::thread::Builder::new().name((*name).to_owned());
             thread.spawn_scoped(scope, run).unwrap();
         }
@@ -128,7 +128,7 @@ fn at_once(scenarios: &[(&str, &(dyn Fn() + Sync))]) {
 }
 
 #[test]
-fn what_dies_is_started_again() {
+fn dead_processes_are_restarted() {
     at_once(&[
         ("capture and tracker", &|| kills_do_not_rewind(&[CAPTURE, TRACKER])),
         ("all three", &|| kills_do_not_rewind(&[CAPTURE, TRACKER, MAPPER])),
@@ -139,7 +139,7 @@ fn what_dies_is_started_again() {
 }
 
 #[test]
-fn what_hangs_is_started_again_and_said() {
+fn hanging_processes_are_restarted_and_reported() {
     at_once(&[
         ("capture", &|| a_hanging_process_is_started_again(CAPTURE)),
         ("tracker", &|| a_hanging_process_is_started_again(TRACKER)),
@@ -151,7 +151,7 @@ fn what_hangs_is_started_again_and_said() {
 }
 
 #[test]
-fn what_others_do_costs_a_run_nothing() {
+fn outside_interference_does_not_affect_a_run() {
     at_once(&[
         ("closed terminal", &a_closed_terminal_ends_a_run_with_its_results),
         ("unread standard error", &a_standard_error_that_nobody_reads_holds_nothing_up),
@@ -170,7 +170,7 @@ fn a_closed_terminal_ends_a_run_with_its_results() {
 }
 
 #[test]
-fn a_replay_that_is_ended_by_any_signal_keeps_its_results() {
+fn a_replay_ended_by_any_signal_keeps_its_results() {
     at_once(&[
         ("interrupted", &|| ends_with_results(Signal::INT)),
         ("terminated", &|| ends_with_results(Signal::TERM)),
@@ -187,14 +187,14 @@ fn ends_with_results(ending: Signal) {
         command.args(["--set", &format!("simulator.{setting}")]);
     }
     let replay = command.spawn().unwrap();
-    // Nothing says that frames are done; what comes too soon ends it without results and another code path.
+    // Nothing reports that frames are done; a signal too early ends it without results and by another code path.
     std::thread::sleep(Duration::from_secs(3));
     signal(&replay, ending);
     let ended = end(replay);
     assert_eq!(ended.status.code(), Some(130), "{ending:?}: {}", ended.stderr);
 }
 
-/// A pipe into which nothing more goes, and who does not read it.
+/// A full pipe, and its reader, which does not read.
 fn full_pipe() -> (PipeReader, PipeWriter) {
     let (reader, mut writer) = std::io::pipe().unwrap();
     let blocking = fcntl_getfl(&writer).unwrap();
@@ -223,7 +223,7 @@ fn a_standard_error_that_nobody_reads_holds_nothing_up() {
     assert_eq!(summary["restarts_by_process"]["tracker"], 1, "{summary}");
 }
 
-/// Whoever hangs is killed and started again, and the summary says why.
+/// Checks that a hanging process is killed and restarted, and that the summary gives the reason.
 fn a_hanging_process_is_started_again(process: usize) {
     let mut live = Live::start(&["--set", "supervisor.watchdog_s=2"]);
     live.until_frames(TRACKER, 45);
@@ -274,7 +274,7 @@ fn a_mapper_that_hangs_at_the_end_does_not_hold_up_the_results() {
     assert!(summary["keyframes"].as_u64().unwrap() > 0, "the checkpoint serves: {summary}");
 }
 
-/// A disk that takes a few kilobytes in a second: a pipe in the place of the file that the mapper fills.
+/// A disk that accepts a few kilobytes per second: a pipe in place of the file that the mapper writes.
 fn slow_disk(path: &Path) -> JoinHandle<usize> {
     rustix::fs::mkfifoat(rustix::fs::CWD, path, Mode::RUSR | Mode::WUSR).unwrap();
     let mut options = fs::OpenOptions::new();
@@ -283,9 +283,9 @@ fn slow_disk(path: &Path) -> JoinHandle<usize> {
     let name = path.to_owned();
     std::thread::spawn(move || {
         let (mut taken, mut bytes) = (0, [0; 2048]);
-        // Renamed when it is filled.
+        // Renamed once it is complete.
         while name.exists() {
-            // Nothing yet, or no more.
+            // No data yet, or no more.
             taken += pipe.read(&mut bytes).unwrap_or(0);
             std::thread::sleep(Duration::from_millis(40));
         }
@@ -302,7 +302,7 @@ fn a_mapper_that_writes_its_map_to_a_slow_disk_is_let_alone() {
     let commands = CommandClient::open(&live.hub).unwrap();
     commands.ask(&Command::SaveMap(map), WATCH_DOG, || true).unwrap();
     drop(commands);
-    // Twice as much as it takes within the watchdog's time.
+    // Twice as much as it accepts within the watchdog's time.
     let taken = disk.join().unwrap();
     assert!(taken > 200_000, "{taken} bytes");
     let (code, stderr, summary, _rig) = live.end();
@@ -325,10 +325,10 @@ fn a_mapper_that_dies_before_it_numbers_anything_leaves_the_first_numbers() {
     assert_eq!(first.split_whitespace().nth(KEYFRAME_ID), Some("0"), "{first}");
 }
 
-/// Where the keyframes of an epoch are, by id.
+/// Poses of the keyframes of an epoch, by id.
 type Places = BTreeMap<u64, SimilarityMessage>;
 
-/// Every graph that was published since the last call.
+/// Every graph published since the last call.
 fn graphs(graph: &Subscriber<KeyframePoseMessage, GraphHeader>) -> Vec<(GraphHeader, Places)> {
     let next = || graph.receive().unwrap();
     let received = std::iter::from_fn(next).map(|message| {
@@ -339,7 +339,7 @@ fn graphs(graph: &Subscriber<KeyframePoseMessage, GraphHeader>) -> Vec<(GraphHea
 }
 
 fn a_mapper_that_dies_during_an_estimate_leaves_a_map_as_it_was_published() {
-    // Estimates that take long, so that each death falls into one.
+    // Slow estimates, so that each death falls into one.
     let slow = ["--live", "--set", "mapping.window.max_first_iterations=200"];
     let rig = Rig::new();
     let run = rig.run(450, &slow).spawn().unwrap();
@@ -347,8 +347,8 @@ fn a_mapper_that_dies_during_an_estimate_leaves_a_map_as_it_was_published() {
     let graph = until("the graph", || live.hub.subscriber(&GRAPH).ok());
     let mut published: Vec<(GraphHeader, Places)> = Vec::new();
     for least in [3, 4] {
-        // An estimate begins when its keyframe has been published; the map is at most one keyframe older, and of that too
-        // the graph has been seen.
+        // An estimate starts once its keyframe has been published; the map is at most one keyframe older, and the
+        // graph of that has been seen too.
         let (mut known, mut new_ones) = (0, 0);
         until("two new keyframes", || {
             let new = graphs(&graph);
@@ -359,14 +359,14 @@ fn a_mapper_that_dies_during_an_estimate_leaves_a_map_as_it_was_published() {
             (new_ones >= 2 && known >= least).then_some(())
         });
         let before = live.pid(MAPPER);
-        // What it has sent is lost with it, so that it is read before.
+        // Messages it has sent are lost with it, so they are read first.
         live.send(&[MAPPER], Signal::STOP);
         std::thread::sleep(Duration::from_millis(50));
         published.extend(graphs(&graph));
         live.send(&[MAPPER], Signal::KILL);
         live.until_replaced(MAPPER, before);
         let newest = published.iter().map(|(header, _)| header.revision).max().unwrap();
-        // The successor leaves numbers out.
+        // The successor skips numbers.
         let successor = until("the successor's graph", || {
             let new = graphs(&graph);
             let first = new.iter().find(|(header, _)| header.revision > newest + 1000).cloned();
@@ -390,7 +390,7 @@ fn a_mapper_that_dies_during_an_estimate_leaves_a_map_as_it_was_published() {
     assert_eq!((&summary["restarts"], &summary["epoch"]), (&Value::from(2), &Value::from(0)));
 }
 
-/// Runs `script` in a shell with a /dev/shm of its own, of `megabytes`.
+/// Runs `script` in a shell with a separate /dev/shm of `megabytes`.
 fn with_shared_memory(rig: &Rig, megabytes: u32, script: &str) -> Option<Ended> {
     let mount = format!("mount -t tmpfs -o size={megabytes}m tmpfs /dev/shm");
     with_mount(rig, &mount, script)
@@ -402,7 +402,7 @@ const SMALL: &str = "--live --source loop:300:30:sim --output $OUTPUT --set simu
 
 fn shared_memory_that_others_fill_costs_a_run_nothing() {
     let rig = Rig::new();
-    // Whatever is left once frames flow is taken by somebody else.
+    // Another process takes whatever is left once frames arrive.
     let script = format!(
         "$SEMIDENSE run {SMALL} & run=$!; \
          until $SEMIDENSE status --once --json 2>/dev/null | grep -q '\"mapping\"' || ! kill -0 $run; \
@@ -413,7 +413,7 @@ fn shared_memory_that_others_fill_costs_a_run_nothing() {
     let Some(ended) = with_shared_memory(&rig, 64, &script) else { return };
     assert_eq!(ended.status.code(), Some(0), "{}", ended.stderr);
     assert!(!ended.stderr.contains("SIGBUS"), "{}", ended.stderr);
-    // Nobody new has room, and it is said.
+    // There is no room for a new process, which is reported.
     assert!(ended.stderr.contains("status 1"), "{}", ended.stderr);
     assert!(ended.stderr.contains("error: /dev/shm has only 0 MB free"), "{}", ended.stderr);
     let summary = fs::read_to_string(rig.output().join("summary.json")).unwrap();
@@ -423,7 +423,7 @@ fn shared_memory_that_others_fill_costs_a_run_nothing() {
 }
 
 #[test]
-fn shared_memory_that_is_too_small_is_said_in_one_line_at_the_start() {
+fn shared_memory_that_is_too_small_is_reported_in_one_line_at_the_start() {
     let rig = Rig::new();
     for megabytes in [1, 10, 24] {
         let script = format!("$SEMIDENSE run {SMALL}");
@@ -435,7 +435,7 @@ fn shared_memory_that_is_too_small_is_said_in_one_line_at_the_start() {
     }
 }
 
-/// What `status` says of a live run once.
+/// One output of `status` for a live run.
 fn status(rig: &Rig) -> Value {
     let ended = finish(rig.command(&["status", "--once", "--json"]));
     assert!(ended.status.success(), "{}", ended.stderr);
@@ -456,7 +456,7 @@ fn status_knows_the_age_of_the_run_and_its_keyframes_whoever_died_or_is_stopped(
     assert_eq!(status["mapper"]["state"], "stopped", "{status}");
     assert!(status["keyframes"].as_u64().is_some_and(|keyframes| keyframes > 0), "{status}");
     let up = |value: &Value| value["uptime_secs"].as_f64().unwrap();
-    // They were killed two seconds after the start at the earliest.
+    // They were killed at least two seconds after the start.
     assert!(up(&status) > up(&status["capture"]) + 1.0, "{status}");
     let sent = &status["capture"]["latency_ms"];
     assert!(sent["p50"].as_f64() <= sent["p99"].as_f64() && sent["p50"].is_number(), "{status}");

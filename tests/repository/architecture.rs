@@ -1,5 +1,5 @@
-//! The structure: imports run down, `slam` is pure, foreign names stay in their module,
-//! files can be read in one sitting. The rule about imports is the table in docs/development.md.
+//! The structure of the source: imports run down, `slam` is pure, foreign names stay in their module, files can be
+//! read in one sitting. The rule about imports is the table in docs/development.md.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fs;
@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 /// A file longer than this is split along its algorithm.
 const MAX_LINES: usize = 500;
 
-/// What only some modules may name, and why.
+/// Names that are reserved to some modules, and why.
 const RESERVED: &[(&str, &[&str], &str)] = &[
     ("iceoryx2::", &["src/wire"], "its API changes with every release: one module to change"),
     ("png::", &["src/capture"], "image files are read and written in one module"),
@@ -27,11 +27,11 @@ const RESERVED: &[(&str, &[&str], &str)] = &[
     ("std::process::exit", &["src/command"], "only commands choose exit codes"),
 ];
 
-/// What `slam` must not do: it takes images and poses and gives poses and depth.
+/// What `slam` must not use: it takes images and poses and returns poses and depth.
 const IMPURE: &[&str] =
     &["std::fs", "std::io", "std::net", "std::env", "rand::", "thread_local!", "static mut"];
 
-/// Where `unsafe` may stand.
+/// Where `unsafe` may be used.
 const UNSAFE_MODULES: &[&str] = &["src/wire", "src/capture/v4l", "src/service/schedule.rs"];
 const UNSAFE_KERNEL_MARK: &str = "kernel";
 
@@ -68,7 +68,7 @@ fn sources(folder: &str) -> Vec<(String, Vec<String>)> {
         .collect()
 }
 
-/// The table of docs/development.md, `| module | may import | … |` as module → modules.
+/// The table of docs/development.md, `| module | may import | … |`, as module → modules.
 fn allowed_imports() -> BTreeMap<String, Vec<String>> {
     let page = fs::read_to_string(root().join("docs/development.md")).unwrap();
     let rows = page.lines().skip_while(|l| !l.starts_with("| module | may import")).skip(2);
@@ -89,11 +89,11 @@ fn allowed_imports() -> BTreeMap<String, Vec<String>> {
     table
 }
 
-/// Which files a file imports from, by the paths of their modules: `src/slam/map.rs` is `slam::map`.
+/// The files that each file imports from, by the paths of their modules: `src/slam/map.rs` is `slam::map`.
 type Imports = BTreeMap<String, BTreeSet<String>>;
 
-/// The code of a file without what is only for tests, and the modules that it declares for these. An item ends where
-/// a line as far in as its attribute ends it.
+/// The code of a file without its test-only items, and the modules that it declares for tests. An item ends at the
+/// first closing line with the indentation of its attribute.
 fn without_tests(lines: &[String]) -> (String, Vec<String>) {
     let (mut code, mut test_modules) = (String::new(), Vec::new());
     let mut lines = lines.iter();
@@ -118,7 +118,7 @@ fn without_tests(lines: &[String]) -> (String, Vec<String>) {
     (code, test_modules)
 }
 
-/// The paths of a tree as in `use`, from `text` on, behind `before`; what comes after the tree.
+/// Collects the paths of a `use` tree that starts at `text`, prefixed by `before`; returns the text after the tree.
 fn read_tree<'a>(text: &'a str, before: &str, paths: &mut Vec<String>) -> &'a str {
     let is_name = |c: char| c.is_alphanumeric() || c == '_' || c == ':' || c == '*';
     let end = text.find(|c| !is_name(c)).unwrap_or(text.len());
@@ -145,7 +145,7 @@ fn read_tree<'a>(text: &'a str, before: &str, paths: &mut Vec<String>) -> &'a st
     }
 }
 
-/// What the code of `module` names: by whole paths, and its own parts by theirs.
+/// The paths used by the code of `module`, including its own submodules.
 fn named_in(module: &str, code: &str) -> Vec<String> {
     let parent = module.rsplit_once("::").map_or("", |(parent, _)| parent);
     let starts = [("crate::", ""), ("super::", parent), ("self::", module)];
@@ -169,7 +169,7 @@ fn named_in(module: &str, code: &str) -> Vec<String> {
     named
 }
 
-/// All imports between the files of a folder, tests left out.
+/// All imports between the files of a folder, excluding tests.
 fn imports_in(folder: &str) -> Imports {
     let mut codes = BTreeMap::new();
     let mut for_tests = Vec::new();
@@ -191,7 +191,7 @@ fn imports_in(folder: &str) -> Imports {
     codes.iter().map(imports_of).collect()
 }
 
-/// The file that a path leads into: of those that it begins with the longest.
+/// The file that a path leads into: its longest prefix that is a file.
 fn file_of<'a>(path: &'a str, codes: &BTreeMap<String, String>) -> Option<&'a str> {
     let ends = path.match_indices("::").map(|(end, _)| end).chain([path.len()]);
     ends.map(|end| &path[..end]).filter(|module| codes.contains_key(*module)).last()
@@ -201,7 +201,7 @@ fn is_below(module: &str, other: &str) -> bool {
     module.strip_prefix(other).is_some_and(|rest| rest.starts_with("::"))
 }
 
-/// The shortest path along imports, both ends included.
+/// The shortest path along imports, including both ends.
 fn shortest_path(imports: &Imports, from: &str, to: &str) -> Option<Vec<String>> {
     let mut before = BTreeMap::from([(from.to_owned(), None)]);
     let mut waiting = VecDeque::from([from.to_owned()]);
@@ -222,8 +222,8 @@ fn shortest_path(imports: &Imports, from: &str, to: &str) -> Option<Vec<String>>
     None
 }
 
-/// The shortest circle of imports that is more than a file and its parts: none of its files is above all others, or
-/// there is one without the imports from a part to a file above it.
+/// The shortest import cycle other than between a file and its parts: one in which no file is above all others, or
+/// that remains without the imports from a part to a file above it.
 fn circle_in(imports: &Imports) -> Option<Vec<String>> {
     let mut down = imports.clone();
     for (module, others) in &mut down {
@@ -244,7 +244,7 @@ fn circle_in(imports: &Imports) -> Option<Vec<String>> {
 }
 
 #[test]
-fn a_module_with_parts_is_a_file_beside_its_folder() {
+fn a_module_with_parts_is_a_file_next_to_its_folder() {
     for folder in ["src", "bridge/src", "c/src"] {
         for (file, _) in sources(folder) {
             assert!(!file.ends_with("/mod.rs"), "{file}: name it after its folder, beside it");
@@ -283,7 +283,7 @@ fn imports_run_down() {
 }
 
 #[test]
-fn imports_make_no_circles() {
+fn imports_have_no_cycles() {
     for folder in ["src", "bridge/src", "c/src"] {
         let imports = imports_in(folder);
         assert!(imports.values().any(|others| !others.is_empty()), "no imports in {folder}");
@@ -352,7 +352,7 @@ fn unsafe_stays_in_its_modules_with_a_reason() {
             }
         }
     }
-    // Of the other packages only the boundary to C needs it: its rules are in c/src/lib.rs.
+    // Among the other packages only the boundary to C needs it: its rules are in c/src/lib.rs.
     for (file, lines) in ["bridge/src", "c/src"].into_iter().flat_map(sources) {
         for (number, line) in lines.iter().enumerate() {
             let is_boundary = file == "c/src/exports.rs";
@@ -383,7 +383,7 @@ fn files_can_be_read_in_one_sitting() {
 }
 
 #[test]
-fn every_file_says_first_what_it_is_for() {
+fn every_file_starts_with_its_purpose() {
     let mut files = Vec::new();
     for folder in ["src", "tests", "examples", "benches", "bridge/src", "c"] {
         rust_files(&root().join(folder), &mut files);

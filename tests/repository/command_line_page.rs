@@ -1,20 +1,20 @@
-//! docs/command-line.md is the help of every command, as the program prints it. A change of the command line writes it
-//! anew: `SEMIDENSE_WRITE_REFERENCE=1 cargo test --release --test repository command_line_page`.
+//! docs/command-line.md is the help of every command, as printed by the program. After a change of the command line,
+//! regenerate it: `SEMIDENSE_WRITE_REFERENCE=1 cargo test --release --test repository command_line_page`.
 
 use std::fmt::Write;
 use std::path::Path;
 
 use clap::Command;
 
-/// Columns of the help on the page.
+/// Width of the help on the page, columns.
 const WIDTH: usize = 100;
 
-/// The help of `command` and of what is below it, a section each.
+/// The help of `command` and its subcommands, one section each.
 fn section(command: &mut Command, path: &str, page: &mut String) {
     let name = format!("{path}{}", command.get_name());
     let help = command.clone().term_width(WIDTH).bin_name(&name).render_long_help().to_string();
     let common = help.find("\nCommon options:");
-    // Said once, of the program itself.
+    // Only in the section of the program itself.
     let help = match common.filter(|_| !path.is_empty()) {
         Some(at) => &help[..at],
         None => &help,
@@ -28,7 +28,7 @@ fn section(command: &mut Command, path: &str, page: &mut String) {
 }
 
 #[test]
-fn the_page_is_the_help_of_the_program() {
+fn the_page_equals_the_help_of_the_program() {
     let mut page = "# Command line\n\nEvery command with its options, as `--help` prints them; the options that all \
                     commands have stand with the program itself.\n"
         .to_owned();

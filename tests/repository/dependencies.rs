@@ -1,9 +1,9 @@
-//! Every dependency's licence must allow this package's `MIT OR Apache-2.0`. Works offline: the
-//! licences are read from the metadata of the locked packages.
+//! Every dependency's licence must be compatible with this package's `MIT OR Apache-2.0`. Works offline: the licences
+//! are read from the metadata of the locked packages.
 
 use std::process::Command;
 
-/// Permissive licences that ask for no more than a notice.
+/// Permissive licences that require no more than a notice.
 const ALLOWED: &[&str] = &[
     "MIT",
     "Apache-2.0",
@@ -22,14 +22,14 @@ const ALLOWED: &[&str] = &[
     "IJG",
 ];
 
-/// Whether a licence expression offers a choice whose every part is allowed.
+/// Whether a licence expression offers an alternative whose parts are all allowed.
 fn is_allowed(expression: &str) -> bool {
     let flat = expression.replace(['(', ')'], "").replace('/', " OR ");
     flat.split(" AND ")
         .all(|part| part.split(" OR ").any(|licence| ALLOWED.contains(&licence.trim())))
 }
 
-/// The platform of this machine: what other platforms would need has not been fetched.
+/// The platform of this machine: dependencies of other platforms have not been fetched.
 fn host() -> String {
     let output = Command::new(env!("CARGO")).arg("-vV").output().unwrap();
     let text = String::from_utf8(output.stdout).unwrap();
@@ -38,7 +38,7 @@ fn host() -> String {
 }
 
 #[test]
-fn licences_allow_ours() {
+fn licences_are_compatible_with_ours() {
     let output = Command::new(env!("CARGO"))
         .args(["metadata", "--format-version", "1", "--offline", "--locked"])
         .args(["--filter-platform", &host()])
@@ -65,7 +65,7 @@ fn licences_allow_ours() {
 fn copyleft_is_refused() {
     assert!(is_allowed("MIT OR Apache-2.0") && is_allowed("MIT/Apache-2.0"));
     assert!(is_allowed("(MIT OR Apache-2.0) AND Unicode-3.0") && is_allowed("GPL-3.0 OR MIT"));
-    // Of two licences ours is the permissive one.
+    // Of two licences we choose the permissive one.
     assert!(is_allowed("EPL-2.0 OR Apache-2.0") && !is_allowed("EPL-2.0"));
     assert!(!is_allowed("GPL-3.0") && !is_allowed("MIT AND LGPL-3.0") && !is_allowed("MPL-2.0"));
 }

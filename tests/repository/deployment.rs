@@ -1,5 +1,5 @@
-//! What is installed fits the binary: units call commands that exist, shipped configurations are accepted, the package
-//! has every file, and the pause before a restart grows.
+//! The installed files match the binary: units call existing commands, shipped configurations are accepted, the
+//! package contains every file, and the pause before a restart grows.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -36,15 +36,15 @@ fn units_call_commands_that_exist() {
     }
 }
 
-/// A booted machine needs minutes to tell that its services refuse their configuration.
+/// A booted machine takes minutes to report that its services refuse their configuration.
 #[test]
-fn the_robot_of_the_checks_has_a_configuration_that_is_accepted() {
+fn the_configuration_of_the_test_robot_is_accepted() {
     let rig = root().join("deploy/robot-test/guest/robot.toml");
     Config::load(Some(&rig), &[]).unwrap();
 }
 
 #[test]
-fn units_are_closed_alike() {
+fn units_have_the_same_sandbox() {
     let closed = |process: &str| -> BTreeSet<String> {
         let text = unit(process);
         let (_, section) = text.split_once("# Everything else is closed.").unwrap();
@@ -59,7 +59,7 @@ fn units_are_closed_alike() {
     }
 }
 
-/// Units of the ways out of shared memory, and the addresses that each may use.
+/// Units of the outputs, and the addresses that each may use.
 const WAYS_OUT: [(&str, &[&str]); 5] = [
     ("view", &["localhost"]),
     ("record", &[]),
@@ -74,7 +74,7 @@ fn bridge_unit(name: &str) -> String {
 }
 
 #[test]
-fn ways_out_are_off_closed_and_below_the_rig() {
+fn outputs_are_disabled_sandboxed_and_have_less_cpu_weight_than_the_rig() {
     let target = fs::read_to_string(root().join("deploy/systemd/semidense@.target")).unwrap();
     let tracker = unit("tracker");
     let (_, closed) = tracker.split_once("# Everything else is closed.").unwrap();
@@ -88,13 +88,13 @@ fn ways_out_are_off_closed_and_below_the_rig() {
         let is_allowed = |line: &&str| line.starts_with("IPAddressAllow=");
         let found = text.lines().find(is_allowed).unwrap_or("IPAddressAllow=");
         assert_eq!(found, format!("IPAddressAllow={allowed}"), "{name}");
-        // What differs is the network, and only where there is one.
+        // They differ only in network settings, and only where the unit uses the network.
         for line in closed.lines().filter(|line| line.contains('=') && !line.starts_with('#')) {
             let is_network =
                 line.starts_with("PrivateNetwork") || line.starts_with("RestrictAddressFamilies");
             assert!(has(line) || is_network && !addresses.is_empty(), "{name} lacks {line}");
         }
-        // A camera feeds the rig; all others come after it.
+        // A camera feeds the rig; all other outputs have a lower priority.
         let weight = text.lines().find_map(|line| line.strip_prefix("CPUWeight=")).unwrap();
         let weight: u32 = weight.parse().unwrap();
         assert_eq!(weight > 100, name == "ros2-camera", "{name}: the usual weight is 100");
@@ -102,7 +102,7 @@ fn ways_out_are_off_closed_and_below_the_rig() {
 }
 
 #[test]
-fn systemd_understands_every_unit() {
+fn systemd_accepts_every_unit() {
     let is_there = Command::new("systemd-analyze").arg("--version").output().is_ok();
     if !is_there {
         eprintln!("left out: there is no systemd-analyze");
@@ -114,7 +114,7 @@ fn systemd_understands_every_unit() {
     let units: Vec<_> =
         units.chain(WAYS_OUT.iter().map(|(name, _)| (named(name), bridge_unit(name)))).collect();
     for (name, text) in &units {
-        // Programs are only looked for: any will do.
+        // systemd only checks that programs exist: any program will do.
         let text = text
             .replace("/usr/bin/semidense-bridge", "/bin/true")
             .replace("/usr/bin/semidense", "/bin/true")
@@ -139,7 +139,7 @@ fn systemd_understands_every_unit() {
 }
 
 #[test]
-fn the_rig_of_the_package_is_accepted() {
+fn the_rig_file_of_the_package_is_accepted() {
     let file = root().join("deploy/debian/webcam.toml");
     let config = Config::load(Some(&file), &[]).unwrap();
     assert!(config.capture.source.starts_with("v4l:"));
@@ -149,7 +149,7 @@ fn the_rig_of_the_package_is_accepted() {
 }
 
 #[test]
-fn the_package_has_every_file() {
+fn the_package_contains_every_file() {
     let text = fs::read_to_string(root().join("Cargo.toml")).unwrap();
     let manifest: toml::Table = text.parse().unwrap();
     let deb = &manifest["package"]["metadata"]["deb"];
@@ -181,7 +181,7 @@ fn the_package_has_every_file() {
 }
 
 #[test]
-fn the_pause_before_a_restart_grows_and_is_forgotten() {
+fn the_pause_before_a_restart_grows_and_is_reset() {
     let folder = tempfile::tempdir().unwrap();
     let after = |result: &str| {
         let status = Command::new("sh")
@@ -193,12 +193,12 @@ fn the_pause_before_a_restart_grows_and_is_forgotten() {
         assert!(status.unwrap().success());
         fs::read_to_string(folder.path().join(".back-off.unit")).ok().map(|t| t.trim().to_owned())
     };
-    // Tenths of a second: the first death waits for nothing.
+    // Tenths of a second: after its first death a process restarts without a pause.
     let pauses: Vec<_> = (0..4).map(|_| after("signal").unwrap()).collect();
     assert_eq!(pauses, ["0", "2", "4", "8"]);
     assert_eq!(after("success"), None);
     assert_eq!(after("watchdog").as_deref(), Some("0"));
-    // A life that was long enough.
+    // A life that was long enough to reset the pause.
     let file = fs::File::options().write(true).open(folder.path().join(".back-off.unit")).unwrap();
     file.set_modified(std::time::UNIX_EPOCH).unwrap();
     assert_eq!(after("signal").as_deref(), Some("0"));

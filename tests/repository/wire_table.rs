@@ -1,8 +1,8 @@
-//! `python/semidense/_wire.py` says what the Rust definitions say: every message field by field, every topic, every code;
-//! `python/tests/offsets.json`, where each field lies, for the Python reader's own test.
+//! `python/semidense/_wire.py` agrees with the Rust definitions: every message field by field, every topic, every
+//! code; `python/tests/offsets.json` lists the offset of each field for the Python reader's own test.
 //!
-//! The fields and their comments are read from `src/wire/message.rs`; sizes, names, codes and quality of service come from
-//! the compiled types. After a change of the wire: `SEMIDENSE_WRITE_WIRE=1 cargo test --test repository wire_table`.
+//! The fields and their comments are read from `src/wire/message.rs`; sizes, names, codes and quality of service come
+//! from the compiled types. To regenerate: `SEMIDENSE_WRITE_WIRE=1 cargo test --test repository wire_table`.
 
 use std::fmt::Write;
 use std::fs;
@@ -25,10 +25,10 @@ use semidense::wire::topic::{
     MAPPER_HEALTH, POSE, STEP, TRACKER_HEALTH, Topic, WIRE_VERSION,
 };
 
-/// Writes the files anew where it is set.
+/// If set, the files are regenerated.
 const WRITE: &str = "SEMIDENSE_WRITE_WIRE";
 
-/// A message as its definition has it.
+/// The definition of a message.
 struct Message {
     name: String,
     comment: String,
@@ -37,7 +37,7 @@ struct Message {
     alignment: usize,
 }
 
-/// A field: its Rust name, its comment, its scalar with the size of it, and the length of an array.
+/// A field: its Rust name, its comment, its scalar type and size, and the length of an array.
 struct Field {
     name: String,
     comment: String,
@@ -110,7 +110,7 @@ fn bytes_of(scalar: &str) -> usize {
     }
 }
 
-/// The `#[repr(C)]` structure `name` of a file, laid out by the rule of C.
+/// The `#[repr(C)]` structure `name` of a file, with the layout rules of C.
 fn message(file: &syn::File, name: &str) -> Message {
     let structures = file.items.iter().filter_map(|item| match item {
         syn::Item::Struct(structure) => Some(structure),
@@ -136,7 +136,7 @@ fn message(file: &syn::File, name: &str) -> Message {
     Message { name: name.into(), comment: comment(&structure.attrs), fields, size, alignment }
 }
 
-/// The Python class of a message, held to the compiled type.
+/// The Python class of a message, checked against the compiled type.
 fn class<T: ZeroCopySend>(text: &mut String, file: &syn::File) -> Message {
     let path = std::any::type_name::<T>();
     let message = message(file, path.rsplit("::").next().unwrap());
@@ -168,7 +168,7 @@ fn class<T: ZeroCopySend>(text: &mut String, file: &syn::File) -> Message {
     message
 }
 
-/// Where the fields of the messages lie, a message a line.
+/// The field offsets of the messages, one message per line.
 fn offsets(messages: &[Message]) -> String {
     let line = |Message { name, fields, .. }: &Message| {
         let of = |Field { name, offset, .. }: &Field| format!("{name:?}: {offset}");
@@ -179,7 +179,7 @@ fn offsets(messages: &[Message]) -> String {
     format!("{{\n{}\n}}\n", lines.join(",\n"))
 }
 
-/// A comment without the links and quotation marks of Rust's documentation.
+/// A comment without the links and code quotes of Rust documentation.
 fn plain(comment: &str) -> String {
     let mut text = comment.replace("[`", "`").replace("`]", "`");
     while let Some(begin) = text.find("`(crate") {
@@ -216,9 +216,9 @@ fn known<T: std::fmt::Debug>(
     codes.filter_map(|code| Some((code, constant_name(&format!("{:?}", of(code)?))))).collect()
 }
 
-/// States and reasons: a reason's name is unique, its code only with its state.
+/// States and reasons: a reason's name is unique, its code only together with its state.
 fn state_enumerations(text: &mut String) {
-    /// More than there are of either.
+    /// More than the number of either.
     const CODES: u32 = 100;
     let head = |state: TrackingState| format!("{state:?}").split('(').next().unwrap().to_owned();
     let states: Vec<_> = (0..CODES)
@@ -264,7 +264,7 @@ fn state_enumerations(text: &mut String) {
     codes(text, "Scheduling", "Scheduling in force of a process.", &schedulings);
 }
 
-/// A line of the table of topics, held to the types that the readers in Rust use.
+/// A line of the table of topics, checked against the types used by the Rust readers.
 fn topic<T, H>(text: &mut String, topic: &Topic) {
     let short = |name: &'static str| match name.rsplit("::").next().unwrap() {
         "u8" => "ctypes.c_uint8".to_owned(),
@@ -312,7 +312,7 @@ fn topics(text: &mut String) {
     writeln!(text, "COMMAND_TOPIC = {MAPPER_COMMAND:?}").unwrap();
 }
 
-/// Where an instance lives; prefixes of some folders, for the reader's own test.
+/// The place of an instance; prefixes of some folders, for the reader's own test.
 fn places(text: &mut String) {
     writeln!(text, "\nROOT_VARIABLE = {ROOT_VARIABLE:?}\nSYSTEM_ROOT = {SYSTEM_ROOT:?}").unwrap();
     text.push_str("PREFIXES = {\n");
@@ -335,9 +335,9 @@ import enum
 from typing import NamedTuple, Optional
 "#;
 
-/// The files with their text.
+/// The generated files with their content.
 fn generated() -> [(&'static str, String); 2] {
-    /// Ends of buckets on a line.
+    /// Bucket boundaries per line.
     const ENDS: usize = 5;
     let parse =
         |path: &str| syn::parse_file(&fs::read_to_string(root().join(path)).unwrap()).unwrap();

@@ -1,5 +1,5 @@
-//! The system's allocator, counting in the threads that ask for it. Who includes this file has it as its
-//! allocator.
+//! The system's allocator, counting allocations in selected threads. A test that includes this file uses it as its
+//! global allocator.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -14,23 +14,23 @@ thread_local! {
     static IS_COUNTED: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Whether the calling thread's allocations count from now on.
+/// Sets whether allocations of the calling thread are counted from now on.
 pub fn count_here(counts: bool) {
     IS_COUNTED.set(counts);
 }
 
-/// The allocations of all threads count from now on.
+/// Counts the allocations of all threads from now on.
 pub fn count_everywhere() {
     COUNTS_ALL.store(true, Ordering::SeqCst);
 }
 
-/// Allocations so far, of all threads that count.
+/// Number of allocations so far in all counted threads.
 pub fn allocations() -> u64 {
     ALLOCATIONS.load(Ordering::SeqCst)
 }
 
 fn count() {
-    // A thread that ends has no locals any more.
+    // The locals of an ending thread are gone.
     if COUNTS_ALL.load(Ordering::Relaxed) || IS_COUNTED.try_with(Cell::get).unwrap_or(false) {
         ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
     }

@@ -1,16 +1,16 @@
-//! Figures that are pinned: what a test measures must be near what the table `tests/figures.toml` has, better or
-//! worse. Replays are the same bits on every run, and with portable arithmetic on every machine, so that only a
-//! change of the program moves them. `SEMIDENSE_WRITE_FIGURES=1 cargo test --release` writes the table anew.
+//! Pinned figures: a measurement must be close to its value in the table `tests/figures.toml`, better or worse.
+//! Replays give the same bits on every run and, with portable arithmetic, on every machine, so that only a change of
+//! the program moves them. `SEMIDENSE_WRITE_FIGURES=1 cargo test --release` regenerates the table.
 
 use std::fs::{File, OpenOptions};
 use std::path::Path;
 
 use toml::{Table, Value};
 
-/// Set it to write the table instead of comparing with it.
+/// If set, the table is written instead of compared.
 const WRITE_VARIABLE: &str = "SEMIDENSE_WRITE_FIGURES";
 
-/// Share of its value by which a figure may differ from the table.
+/// Relative difference by which a figure may deviate from the table.
 const TOLERANCE: f64 = 0.2;
 
 /// First lines of the table.
@@ -20,7 +20,7 @@ const HEAD: &str = "\
 # the table anew: SEMIDENSE_WRITE_FIGURES=1 cargo test --release --test estimation -- accuracy depth_modes
 ";
 
-/// A figure that is measured.
+/// A measured figure.
 #[derive(Debug, Clone, Copy)]
 pub struct Figure {
     name: &'static str,
@@ -35,7 +35,7 @@ impl Figure {
         Self { name, value, tolerance: TOLERANCE, slack }
     }
 
-    /// A number of things that may differ by no more than `slack`.
+    /// A count that may differ by at most `slack`.
     pub fn count(name: &'static str, value: f64, slack: f64) -> Self {
         Self { name, value, tolerance: 0.0, slack }
     }
@@ -45,7 +45,7 @@ impl Figure {
     }
 }
 
-/// Holds the figures of a `section` against the table, or writes them into it.
+/// Compares the figures of a `section` with the table, or writes them to it.
 pub fn hold(section: &str, figures: &[Figure]) {
     let table = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/figures.toml");
     if std::env::var_os(WRITE_VARIABLE).is_some() {
@@ -78,7 +78,7 @@ fn read(table: &Path) -> Table {
     text.parse().expect("tests/figures.toml is TOML")
 }
 
-/// Replaces a section; one test at a time, as several write the same file.
+/// Replaces a section; locked, as several tests write the same file.
 fn write(table: &Path, section: &str, figures: &[Figure]) {
     let lock = Path::new(env!("CARGO_TARGET_TMPDIR")).join("figures.lock");
     let held: File = OpenOptions::new().create(true).append(true).open(lock).unwrap();
@@ -91,7 +91,7 @@ fn write(table: &Path, section: &str, figures: &[Figure]) {
     std::fs::rename(&written, table).unwrap();
 }
 
-/// Four digits are enough for a fifth.
+/// Four digits suffice for a tolerance of a fifth.
 fn rounded(value: f64) -> f64 {
     format!("{value:.3e}").parse().unwrap()
 }

@@ -1,4 +1,4 @@
-//! Public pose graphs in the format of g2o.
+//! Public pose graphs in g2o format.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -8,12 +8,12 @@ use semidense::slam::geometry::sim3::{Matrix7, Sim3};
 use semidense::slam::graph::pose_graph::{Constraint, PoseGraph};
 use semidense::slam::graph::robust::RobustKernel;
 
-/// Share of the largest entry by which rounding to six digits makes a matrix indefinite.
+/// Relative tolerance, by the largest entry, for matrices that are indefinite only by rounding to six digits.
 const INFORMATION_ROUNDING: f64 = 1e-5;
 
-/// The graph of a file of `VERTEX_SE3:QUAT` and `EDGE_SE3:QUAT` lines: the first vertex is fixed, the others start along a
-/// breadth-first tree of constraints from it. Information that is indefinite (5021 constraints of cubicle) counts without
-/// what it says of translation and rotation together.
+/// The graph of a file of `VERTEX_SE3:QUAT` and `EDGE_SE3:QUAT` lines: the first vertex is fixed, the others are
+/// initialised along a breadth-first tree of constraints from it. Indefinite information (5021 constraints of cubicle)
+/// is used without its cross terms of translation and rotation.
 pub fn read(path: &Path) -> PoseGraph {
     let text = std::fs::read_to_string(path).unwrap();
     let (mut places, mut edges) = (BTreeMap::new(), Vec::new());
@@ -68,7 +68,7 @@ fn similarity(values: &[f64]) -> Sim3 {
     Sim3::new(SE3::try_from_parts([qx, qy, qz, qw], [x, y, z]).unwrap(), 1.0)
 }
 
-/// The upper triangle by rows, of translation and rotation; nothing is known of scale.
+/// The upper triangle, row by row, for translation and rotation; scale is unconstrained.
 fn information(values: &[f64]) -> Matrix7 {
     let mut matrix = Matrix7::zeros();
     let places = (0..6).flat_map(|row| (row..6).map(move |column| (row, column)));

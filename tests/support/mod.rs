@@ -1,4 +1,4 @@
-//! What the tests of the real binary share: an instance of its own for each test, and watch-dogs.
+//! Shared parts of the tests of the real binary: a separate instance for each test, and watch-dogs.
 
 use std::fs;
 use std::io::Read;
@@ -12,10 +12,10 @@ use semidense::wire::folders::SHARED_MEMORY;
 use semidense::wire::place::Place;
 use semidense::wire::port::{Access, Hub};
 
-/// Far above anything that is expected: it ends a test that hangs, it measures nothing.
+/// Far above any expected duration: it ends a test that hangs, it measures nothing.
 pub const WATCH_DOG: Duration = Duration::from_secs(240);
 
-/// An instance of its own: folder, prefix of shared memory, output.
+/// A separate instance: folder, prefix of shared memory, output.
 pub struct Rig {
     folder: tempfile::TempDir,
 }
@@ -26,7 +26,7 @@ pub fn small_camera(frames: usize) -> [String; 4] {
     [format!("frames={frames}"), fixed("width=160"), fixed("height=120"), fixed("focal_px=131.0")]
 }
 
-/// How a command ended.
+/// Result of a finished command.
 pub struct Ended {
     pub status: ExitStatus,
     pub stdout: String,
@@ -81,7 +81,7 @@ impl Rig {
         until("somebody to observe", || Hub::join(&self.place(), "observer", Access::Observer).ok())
     }
 
-    /// What is left of this instance in shared memory and in its folder.
+    /// The remains of this instance in shared memory and in its folder.
     pub fn leftovers(&self) -> Vec<String> {
         let names = |folder: &Path| {
             let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
@@ -94,7 +94,7 @@ impl Rig {
     }
 }
 
-/// Asks again and again until there is an answer.
+/// Calls `ask` repeatedly until there is an answer.
 pub fn until<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
     let start = Instant::now();
     loop {
@@ -106,7 +106,7 @@ pub fn until<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// The journal of the run that writes into `folder`, once it holds so many poses, lost ones too.
+/// The journal of the run that writes to `folder`, once it contains `poses` poses, including lost ones.
 pub fn journal_of(folder: &Path, poses: usize) -> PathBuf {
     until("a journal", || {
         let mut entries = fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path());
@@ -115,8 +115,8 @@ pub fn journal_of(folder: &Path, poses: usize) -> PathBuf {
     })
 }
 
-/// Waits for the end of a child; one that hangs is killed and fails the test. What it says is read meanwhile: a
-/// full pipe holds nobody up.
+/// Waits for the end of a child; one that hangs is killed and fails the test. Its output is read meanwhile, so that a
+/// full pipe does not block it.
 pub fn end(mut child: Child) -> Ended {
     let stdout = child.stdout.take().map(read_all);
     let stderr = child.stderr.take().map(read_all);
@@ -141,24 +141,23 @@ pub fn end(mut child: Child) -> Ended {
     Ended { status, stdout, stderr }
 }
 
-/// Reads to the end on a thread of its own.
+/// Reads to the end on a separate thread.
 fn read_all(mut pipe: impl Read + Send + 'static) -> Receiver<String> {
     let (sender, receiver) = channel();
     std::thread::spawn(move || {
         let mut bytes = Vec::new();
         pipe.read_to_end(&mut bytes).unwrap();
-        // Who has waited in vain is gone.
+        // The receiver is gone if its wait timed out.
         let _ = sender.send(String::from_utf8_lossy(&bytes).into_owned());
     });
     receiver
 }
 
-/// Set where tests that need mounts of their own cannot run and are to be left out.
+/// Set where tests that need their own mounts cannot run and are to be skipped.
 const WITHOUT_MOUNTS: &str = "SEMIDENSE_TEST_WITHOUT_MOUNTS";
 
-/// `script` in a shell with mounts of its own, after `mount`, with the binary in $SEMIDENSE; as root, or as one
-/// who is root in a namespace of users. Where neither is allowed the test fails, or with [`WITHOUT_MOUNTS`] there
-/// is no result.
+/// Runs `script` in a shell with its own mounts, after `mount`, with the binary in $SEMIDENSE; as root, or as root of
+/// a user namespace. If neither is allowed the test fails, or with [`WITHOUT_MOUNTS`] there is no result.
 pub fn with_mount(rig: &Rig, mount: &str, script: &str) -> Option<Ended> {
     let shell = |options: &[&str], script: &str| {
         let binary = rig.command(&[]).get_program().to_owned();

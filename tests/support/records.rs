@@ -1,4 +1,4 @@
-//! Records of runs made by hand, and a source whose depth is a wall.
+//! Handmade records of runs, and a source whose depth is a wall.
 
 use semidense::capture::source::{FrameSource, FrameStamp};
 use semidense::capture::source_error::SourceError;
@@ -19,7 +19,7 @@ use std::path::Path;
 
 pub const INTRINSICS: Intrinsics = Intrinsics::pinhole(32, 24, 30.0);
 
-/// A source whose only use is its depth: 4 m at every pixel of every frame.
+/// A source used only for its depth: 4 m at every pixel of every frame.
 pub struct Wall;
 
 impl FrameSource for Wall {
@@ -44,7 +44,7 @@ pub fn nanos(i: usize) -> i64 {
     1_305_033_527_000_000_001 + i as i64 * 33_333_333
 }
 
-/// Where the camera of frame i truly is, metres.
+/// True pose of the camera for frame i, metres.
 pub fn truth(i: usize) -> SE3 {
     let t = i as f64 / 30.0;
     SE3 { translation: [t.sin(), 0.1 * (3.0 * t).cos(), 0.5 * t].into(), ..SE3::identity() }

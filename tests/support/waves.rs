@@ -1,4 +1,4 @@
-//! Smooth waves on a wall at depth 1: frames that can be tracked, and a keyframe of them.
+//! Smooth waves on a wall at depth 1: frames that can be tracked, and a keyframe of the wall.
 
 use semidense::service::clock::{now_nanos, realtime_of};
 use semidense::slam::geometry::intrinsics::Intrinsics;
@@ -6,10 +6,10 @@ use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::wire::message::FrameHeader;
 
-/// What they are seen with.
+/// The camera that sees them.
 pub const CAMERA: Intrinsics = Intrinsics::pinhole(320, 240, 260.0);
 
-/// Of a frame that is sent now.
+/// The header of a frame that is sent now.
 pub fn header(sequence: u64) -> FrameHeader {
     let now = now_nanos();
     FrameHeader {

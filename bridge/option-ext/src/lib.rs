@@ -1,6 +1,6 @@
-//! Whether an option holds a value: all that `dirs-sys` uses of the crate of this name.
+//! Whether an option holds a given value: the only function that `dirs-sys` uses of the crate of this name.
 
-/// The method.
+/// Adds [`OptionExt::contains`].
 pub trait OptionExt<T> {
     /// Whether it holds a value equal to `value`.
     fn contains<U>(&self, value: &U) -> bool
@@ -22,7 +22,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_an_equal_value_is_held() {
+    fn only_an_equal_value_is_contained() {
         assert!(OptionExt::contains(&Some(3), &3) && !OptionExt::contains(&Some(3), &4));
         assert!(!OptionExt::contains(&None::<i32>, &3));
     }

@@ -1,4 +1,4 @@
-//! `semidense-bridge record`.
+//! `semidense-bridge record`: writes an instance's topics to an MCAP file.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -15,14 +15,14 @@ use crate::ros::encoder::Moment;
 use crate::ros::images::ImageFormat;
 use crate::session::{Event, Session, Wants};
 
-/// Bytes that may wait for the disk: two seconds of a 640x480 camera at 100 Hz.
+/// Bytes that may be queued for the disk: two seconds of a 640x480 camera at 100 Hz.
 const QUEUE_BYTES: u64 = 64 << 20;
-/// Longest wait for messages: how exact `--duration` is.
+/// Upper limit for a wait for messages, hence the resolution of `--duration`.
 const WAIT: Duration = Duration::from_millis(100);
-/// How long an instance is waited for before that is said.
+/// How long to wait for an instance before printing a notice.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// Record what a running instance sends into an MCAP file
+/// Record what a running instance publishes to an MCAP file
 #[derive(Debug, Args)]
 #[command(
     after_help = "Records images, poses with covariance, odometry, tf, keyframes as point clouds, the map's graph and \
@@ -35,32 +35,32 @@ const PATIENCE: Duration = Duration::from_secs(1);
                   semidense record --output recordings/ --max-bytes 2000000000"
 )]
 pub struct RecordArguments {
-    /// File to write, which must not exist; in a folder, the file is named after the instance and the time
+    /// File to write, which must not exist; for a folder, a file in it named after the instance and the time
     #[arg(long, short, value_name = "FILE")]
     output: PathBuf,
-    /// How images are written
+    /// Format of the images
     #[arg(long, value_enum, default_value_t = ImageFormat::Png)]
     images: ImageFormat,
-    /// End after so many seconds of recording
+    /// Stop after this many seconds of recording
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     duration: Option<Duration>,
-    /// Begin a new file (run_1.mcap, run_2.mcap, …) when one has so many bytes
+    /// Start a new file (run_1.mcap, run_2.mcap, …) when one has reached this many bytes
     #[arg(long, value_name = "BYTES", value_parser = clap::value_parser!(u64).range(1_000_000..))]
     max_bytes: Option<u64>,
-    /// Begin a new file when one is so many seconds long
+    /// Start a new file when one has reached this many seconds
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     max_duration: Option<Duration>,
 }
 
-/// A positive number of seconds.
+/// Parses a positive number of seconds.
 fn parse_seconds(text: &str) -> Result<Duration, String> {
-    /// A year: more is a mistake.
+    /// A year: anything longer is a mistake.
     const MOST: f64 = 366.0 * 86_400.0;
     let wanted = "needs a number of seconds above 0";
     number_within(text, f64::MIN_POSITIVE..=MOST, wanted).map(Duration::from_secs_f64)
 }
 
-/// Runs it until the instance ends, a signal comes or the time is over.
+/// Records until the instance ends, a signal arrives or the time is over.
 pub fn run(common: &CommonArguments, arguments: &RecordArguments) -> CommandResult {
     let place = common.place()?;
     let instance = place.instance.clone();
@@ -90,17 +90,17 @@ pub fn run(common: &CommonArguments, arguments: &RecordArguments) -> CommandResu
     let summary = writing.join().map_err(|_| "the recorder's thread failed")?;
     let began = began?;
     if let (None, Ok(_)) = (began, &summary) {
-        // Nothing came: an empty file would only stand in the way.
+        // Nothing was recorded: do not leave an empty file behind.
         std::fs::remove_file(&output)?;
         return Err(
-            "nothing was recorded: no instance was there; start one with `semidense run`".into()
+            "nothing was recorded: no instance was running; start one with `semidense run`".into(),
         );
     }
     print(&summary?, began, counts.dropped());
     Ok(ExitCode::SUCCESS)
 }
 
-/// Reads until the end and gives when recording began; `None` where no instance came.
+/// Reads until the end and returns when recording started; `None` if no instance appeared.
 fn read(
     session: &mut Session,
     sender: &QueueSender,
@@ -125,7 +125,7 @@ fn read(
     Ok(began)
 }
 
-/// A name of its own in a folder.
+/// Path of the recording; in a folder, named after the instance and the time.
 fn output_file(output: &Path, instance: &str) -> PathBuf {
     if !output.is_dir() {
         return output.to_owned();
@@ -140,7 +140,7 @@ fn print(summary: &RecordSummary, began: Option<Instant>, dropped: u64) {
     };
     let files: Vec<String> = summary.files.iter().map(|file| file.display().to_string()).collect();
     let seconds = began.map_or(0.0, |began| began.elapsed().as_secs_f64());
-    // Nobody may read it any more.
+    // Standard output may be closed by now.
     let _ = writeln!(
         std::io::stdout(),
         "{}: {seconds:.1} s, {:.1} MB: {} images, {} poses, {} clouds, {dropped} dropped",

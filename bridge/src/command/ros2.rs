@@ -1,4 +1,4 @@
-//! `semidense-bridge ros2` and `ros2-camera`: ROS 2 without ROS.
+//! `semidense-bridge ros2` and `ros2-camera`: ROS 2 without an installation of ROS.
 
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
@@ -17,11 +17,11 @@ use crate::ros2::node::RosNode;
 use crate::ros2::publishing::{PublishParams, Publishers};
 use crate::session::{Session, Wants};
 
-/// Where the node is.
+/// Network of the node.
 #[derive(Debug, Args)]
 pub struct NetworkArguments {
-    /// How far it reaches: localhost, all, or addresses of this machine, as 192.168.1.5 [default: as
-    /// ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_LOCALHOST_ONLY say, else localhost]
+    /// Reach of the node: localhost, all, or addresses of this machine, such as 192.168.1.5 [default: from
+    /// ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_LOCALHOST_ONLY, else localhost]
     #[arg(long, value_name = "REACH", help_heading = "Network")]
     network: Option<Reach>,
     /// DDS domain, 0 to 232 [default: ROS_DOMAIN_ID, else 0]
@@ -56,44 +56,44 @@ pub struct Ros2Arguments {
     /// Name of the node
     #[arg(long, value_name = "NAME", default_value = "semidense")]
     node_name: String,
-    /// Frame of the map
+    /// Frame id of the map
     #[arg(long, value_name = "ID", default_value = "map")]
     frame_map: String,
-    /// Frame of odometry
+    /// Frame id of the odometry frame
     #[arg(long, value_name = "ID", default_value = "odom")]
     frame_odom: String,
-    /// Optical frame of the camera: x right, y down, z forward [default: INSTANCE_optical_frame]
+    /// Frame id of the camera's optical frame: x right, y down, z forward [default: INSTANCE_optical_frame]
     #[arg(long, value_name = "ID")]
     frame_camera: Option<String>,
-    /// Frame of the camera's body, x forward, y left, z up, on /tf_static; empty for none [default: INSTANCE_link]
+    /// Frame id of the camera body on /tf_static: x forward, y left, z up; empty to omit it [default: INSTANCE_link]
     #[arg(long, value_name = "ID")]
     frame_camera_link: Option<String>,
-    /// No images, which are most of the bytes
+    /// Do not publish images, which make up most of the bytes
     #[arg(long)]
     no_images: bool,
-    /// No clouds of points
+    /// Do not publish point clouds
     #[arg(long)]
     no_points: bool,
-    /// No /tf and /tf_static, where something else publishes these frames
+    /// Do not publish /tf and /tf_static, for when another node publishes these frames
     #[arg(long)]
     no_tf: bool,
-    /// At most so many images a second; 0 for all
+    /// Maximum rate of images; 0 for all
     #[arg(long, value_name = "HZ", default_value_t = 0.0, value_parser = parse_rate)]
     image_hz: f64,
-    /// At most so many clouds a second; the newest revision is sent
+    /// Maximum rate of point clouds; the newest revision is sent
     #[arg(long, value_name = "HZ", default_value_t = 1.0, value_parser = parse_rate)]
     points_hz: f64,
-    /// Images and clouds reliable as well: for subscribers that want nothing else, as rviz by default
+    /// Publish images and clouds reliably too, for subscribers that require it, as rviz does by default
     #[arg(long)]
     reliable_sensors: bool,
 }
 
-/// A rate, 0 to 1000 a second.
+/// Parses a rate, 0 to 1000 Hz.
 fn parse_rate(text: &str) -> Result<f64, String> {
     number_within(text, 0.0..=1000.0, "needs a number from 0 to 1000")
 }
 
-/// Least time between two messages at a rate; 0 is no limit.
+/// Minimum time between two messages at a rate; 0 is no limit.
 fn period(rate_hz: f64) -> Duration {
     if rate_hz > 0.0 { Duration::from_secs_f64(1.0 / rate_hz) } else { Duration::ZERO }
 }
@@ -119,7 +119,7 @@ impl Ros2Arguments {
     }
 }
 
-/// Publishes until a signal comes.
+/// Publishes until a signal arrives.
 pub fn run(common: &CommonArguments, arguments: &Ros2Arguments) -> CommandResult {
     let place = common.place()?;
     let params = arguments.params(&place.instance);
@@ -161,7 +161,7 @@ pub fn run(common: &CommonArguments, arguments: &Ros2Arguments) -> CommandResult
     Ok(ExitCode::SUCCESS)
 }
 
-/// Write the images of a ROS 2 topic as frames that capture reads: `semidense run ros2:TOPIC` starts this
+/// Write the images of a ROS 2 topic as frames for capture: `semidense run ros2:TOPIC` starts this command
 #[derive(Debug, Args)]
 #[command(
     after_help = "Writes to standard output, or to the socket of `semidense capture stream:PATH`, as under systemd:\n  \
@@ -172,7 +172,7 @@ pub fn run(common: &CommonArguments, arguments: &Ros2Arguments) -> CommandResult
 pub struct Ros2CameraArguments {
     #[command(flatten)]
     network: NetworkArguments,
-    /// Topic of sensor_msgs/Image, or of CompressedImage where it ends in /compressed
+    /// Topic of type sensor_msgs/Image, or CompressedImage if its name ends in /compressed
     #[arg(value_name = "TOPIC")]
     topic: String,
     /// Name of the node
@@ -181,20 +181,20 @@ pub struct Ros2CameraArguments {
     /// Socket to write to [default: standard output]
     #[arg(long, value_name = "PATH")]
     stream: Option<PathBuf>,
-    /// Write a rig file of the camera's CameraInfo and end
+    /// Write a rig file from the camera's CameraInfo and exit
     #[arg(long, value_name = "FILE", conflicts_with = "stream")]
     write_rig: Option<PathBuf>,
-    /// Topic of the CameraInfo [default: camera_info beside the images]
+    /// Topic of the CameraInfo [default: camera_info next to the image topic]
     #[arg(long, value_name = "TOPIC", requires = "write_rig")]
     camera_info: Option<String>,
-    /// How long the CameraInfo is waited for
+    /// How long to wait for the CameraInfo
     #[arg(long, value_name = "SECONDS", default_value_t = 10, requires = "write_rig")]
     timeout: u64,
 }
 
-/// Writes frames until a signal comes, or nobody reads them.
+/// Writes frames until a signal arrives or the reader closes the stream.
 pub fn run_camera(arguments: &Ros2CameraArguments) -> CommandResult {
-    // The exit code of wrong usage, so that nobody starts this again and again.
+    // The exit code of wrong usage, so that it is not restarted over and over.
     const WRONG_USAGE: u8 = 2;
     if let Err(error) = crate::ros2::node::dds_name(&arguments.topic) {
         note(&format!("error: {error}"));
@@ -213,7 +213,7 @@ pub fn run_camera(arguments: &Ros2CameraArguments) -> CommandResult {
         return Ok(ExitCode::SUCCESS);
     }
     if arguments.stream.is_none() && std::io::stdout().is_terminal() {
-        return Err("standard output is a terminal: frames go to a program, as `semidense run ros2:TOPIC`, or to --stream PATH".into());
+        return Err("standard output is a terminal: pipe the frames to a program, as `semidense run ros2:TOPIC` does, or use --stream PATH".into());
     }
     camera::run(open()?, arguments.topic.clone(), arguments.stream.clone(), &shutdown)?;
     Ok(ExitCode::SUCCESS)

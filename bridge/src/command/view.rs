@@ -1,4 +1,4 @@
-//! `semidense-bridge view`: the live page, or a finished run.
+//! `semidense-bridge view`: serves the live page, or a finished run.
 
 use std::io::Write;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
@@ -23,16 +23,16 @@ use crate::web::scene::{Scene, USUAL_POINTS};
 use crate::web::server::{Server, Shown};
 use crate::web::stream::StreamOptions;
 
-/// Added to the niceness that it was started with: it runs when nobody else wants to.
+/// Added to the niceness it was started with: it runs only when nothing else needs the CPU.
 const NICENESS: i32 = 10;
-/// Time between two looks whether the topics can still be read.
+/// Interval at which the readability of the topics is checked.
 const LOOK_PERIOD: Duration = Duration::from_millis(500);
 
 /// Serve a web page: a running instance live, or a finished run with a time slider
 ///
-/// Live: camera image with the keyframe's depth, the map as it grows, state and its reason, rates, latencies, a button that
-/// saves the map; waits for an instance, and for the next one when it ends. On the same port: /metrics for Prometheus.
-/// Nothing is loaded from elsewhere. It is one more reader: the pipeline does not notice it.
+/// Live: camera image with the keyframe's depth, the growing map, the state and its reason, rates, latencies, and a
+/// button that saves the map; waits for an instance, and for the next one when it ends. On the same port: /metrics for
+/// Prometheus. The page loads nothing from other hosts. It is an ordinary subscriber and does not affect the pipeline.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     semidense view                          then open http://127.0.0.1:8765\n  \
@@ -40,16 +40,16 @@ const LOOK_PERIOD: Duration = Duration::from_millis(500);
     semidense view --listen 0.0.0.0:8765    for a phone: open the address with the token that is printed\n  \
     ssh -L 8765:127.0.0.1:8765 robot        from elsewhere, without opening a port")]
 pub struct ViewArguments {
-    /// Folder of a finished run [default: what runs, live]
+    /// Folder of a finished run [default: the running instance, live]
     #[arg(value_name = "FOLDER")]
     folder: Option<PathBuf>,
-    /// Address and port to serve on; other machines reach it only with an address of this one, 0.0.0.0 for all
+    /// Address and port to serve on; for other machines, an address of this one, or 0.0.0.0 for all its addresses
     #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:8765")]
     listen: SocketAddr,
-    /// Let everybody in who reaches the address: without this, addresses beyond this machine need a token
+    /// Admit anyone who reaches the address; otherwise addresses beyond this machine require a token
     #[arg(long)]
     no_token: bool,
-    /// A name of this machine besides localhost and its IP addresses that pages are opened by; may be repeated
+    /// Another name of this machine, besides localhost and IP addresses, to accept in URLs; may be repeated
     #[arg(long, value_name = "NAME")]
     host: Vec<String>,
     /// Another site whose pages may connect.
@@ -59,13 +59,13 @@ pub struct ViewArguments {
         help = "Another site whose pages may connect, e.g. https://app.foxglove.dev; may be repeated"
     )]
     allow_origin: Vec<String>,
-    /// Most images a second for each page
+    /// Maximum rate of images for each page
     #[arg(long, value_name = "HZ", default_value_t = 10.0, value_parser = rate)]
     image_rate: f64,
-    /// Most points that are kept of the map: 8 bytes each, here and in each page
+    /// Maximum number of map points kept: 8 bytes each, here and in each page
     #[arg(long, value_name = "N", default_value_t = USUAL_POINTS, value_parser = points)]
     max_points: usize,
-    /// Folder in which the button makes a new folder for the map
+    /// Folder in which the save button creates a new folder for the map
     #[arg(long, value_name = "DIR", default_value = "output")]
     maps: PathBuf,
 }
@@ -78,12 +78,12 @@ fn points(text: &str) -> Result<usize, String> {
     number_within(text, 10_000..=50_000_000, "needs a number from 10000 to 50000000")
 }
 
-/// Runs it until a signal comes.
+/// Serves until a signal arrives.
 pub fn run(common: &CommonArguments, arguments: &ViewArguments) -> CommandResult {
     let shutdown = Shutdown::install()?;
-    // Beside a run: it ends with that, however that ends.
+    // As a child of a run, ends with it, however it ends.
     follow_supervisor()?;
-    // Whatever else the machine does comes first; a refusal changes nothing.
+    // Everything else on the machine takes precedence; a refusal is harmless.
     let _ = rustix::process::nice(NICENESS);
     let is_local = arguments.listen.ip().is_loopback();
     let token = (!is_local && !arguments.no_token).then(new_token).transpose()?;
@@ -133,7 +133,7 @@ fn live(
     })
 }
 
-/// Takes in what comes until nothing more will.
+/// Updates the scene from the feed until that ends.
 fn keep_up(listener: &Listener, scene: &Scene) {
     while let Ok(event) = listener.next(LOOK_PERIOD) {
         event.into_iter().for_each(|event| scene.take(event));
@@ -144,7 +144,7 @@ fn start(name: &str, run: impl FnOnce() + Send + 'static) -> std::io::Result<()>
     std::thread::Builder::new().name(name.to_owned()).spawn(run).map(drop)
 }
 
-/// Until a signal comes, or the topics cannot be read any more.
+/// Waits for a signal, or until the topics can no longer be read.
 fn wait_for_end(shutdown: &Shutdown, shown: &Shown) -> Result<Option<String>, WaitError> {
     while !shutdown.is_requested() {
         wait(&[], Some(shutdown.descriptor()), LOOK_PERIOD)?;
@@ -157,27 +157,28 @@ fn wait_for_end(shutdown: &Shutdown, shown: &Shown) -> Result<Option<String>, Wa
     Ok(None)
 }
 
-/// The names that this machine has in its own network.
+/// Names of this machine in its local network.
 fn own_names() -> Vec<String> {
     let name = std::fs::read_to_string(Path::new("/proc/sys/kernel/hostname")).unwrap_or_default();
     let name = name.trim();
     if name.is_empty() { Vec::new() } else { vec![name.to_owned(), format!("{name}.local")] }
 }
 
-/// The address of this machine in the network that its default route leads to.
+/// Address of this machine in the network of its default route.
 fn own_address() -> Option<IpAddr> {
-    /// Of a network for documentation (RFC 5737): connecting a datagram socket chooses a route and sends nothing.
+    /// From a documentation network (RFC 5737): connecting a datagram socket selects a route and sends nothing.
     const ELSEWHERE: (Ipv4Addr, u16) = (Ipv4Addr::new(192, 0, 2, 1), 9);
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).ok()?;
     socket.connect(ELSEWHERE).ok()?;
     Some(socket.local_addr().ok()?.ip())
 }
 
-/// Prints the addresses to open, on standard output: a script may read it.
+/// Prints the addresses to open to standard output, where a script may read them.
 fn say(server: &Server, arguments: &ViewArguments, token: Option<&str>) {
     let address = server.address;
     let shown: Vec<String> = match address.ip() {
-        // It stands for all addresses: the name is one that others can open, the number where names are not looked up.
+        // An unspecified address covers all: print a name that others can open, and a number in case it does not
+        // resolve.
         ip if ip.is_unspecified() => {
             let number = own_address().map(|ip| SocketAddr::new(ip, address.port()).to_string());
             let name = own_names().pop().map(|name| format!("{name}:{}", address.port()));
@@ -196,7 +197,7 @@ fn say(server: &Server, arguments: &ViewArguments, token: Option<&str>) {
     let _ = std::io::stdout().flush();
     if arguments.no_token && !address.ip().is_loopback() {
         note(&format!(
-            "warning: everybody who reaches {address} sees the camera and can save the map: there is no token"
+            "warning: anyone who can reach {address} can see the camera and save the map: no token is required"
         ));
     }
 }

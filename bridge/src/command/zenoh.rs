@@ -1,4 +1,4 @@
-//! `semidense-bridge zenoh`: to another machine, and back into shared memory there.
+//! `semidense-bridge zenoh`: sends topics to another machine and back into shared memory there.
 
 use std::process::ExitCode;
 
@@ -12,7 +12,7 @@ use crate::zenoh::link::{Endpoint, Endpoints};
 use crate::zenoh::receiver::receive;
 use crate::zenoh::sender::{FrameOptions, SendOptions, send};
 
-/// Send to another machine, or receive there, over Zenoh
+/// Send to another machine over Zenoh, or receive there
 #[derive(Debug, Args)]
 #[command(after_help = "\
 On the robot:          semidense run v4l:0 --rig FILE &
@@ -41,22 +41,22 @@ what it does not take in time is dropped, the newest wins; --log info counts it 
 struct SendArguments {
     #[command(flatten)]
     endpoints: Endpoints,
-    /// Send the camera's frames too, as JPEG, as long as somebody receives them
+    /// Also send camera frames, as JPEG, while they are being received
     #[arg(long)]
     frames: bool,
-    /// Quality of the JPEG: at 80 some 40 kB for 640 × 480
+    /// JPEG quality; 80 gives about 40 kB for 640 × 480
     #[arg(long, value_name = "1-100", default_value_t = 80, requires = "frames",
           value_parser = clap::value_parser!(u8).range(1..=100))]
     jpeg_quality: u8,
-    /// Most frames a second
+    /// Maximum rate of frames
     #[arg(long, value_name = "HZ", default_value_t = 10.0, requires = "frames", value_parser = rate)]
     frame_rate: f64,
-    /// Most revisions of a keyframe's depth a second; a new keyframe goes out at once
+    /// Maximum rate of revisions of a keyframe's depth; a new keyframe is sent at once
     #[arg(long, value_name = "HZ", default_value_t = 1.0, value_parser = rate)]
     keyframe_rate: f64,
 }
 
-/// Receive an instance of another machine and publish it here: every subscriber works as it does there
+/// Receive an instance from another machine and publish it here: subscribers work unmodified
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Stamps of CLOCK_MONOTONIC are translated to the clock of this machine, by asking the robot for its own once a second;
@@ -69,12 +69,12 @@ struct ReceiveArguments {
     /// Name of the instance on the robot
     #[arg(long, value_name = "INSTANCE", default_value = "semidense")]
     from: String,
-    /// Name of the instance here [default: as on the robot]
+    /// Name of the local instance [default: as on the robot]
     #[arg(long = "as", value_name = "INSTANCE")]
     local: Option<String>,
 }
 
-/// A rate in Hz.
+/// Parses a rate in Hz.
 fn rate(text: &str) -> Result<f64, String> {
     /// Faster than any camera.
     const MAX_HZ: f64 = 1000.0;
@@ -82,7 +82,7 @@ fn rate(text: &str) -> Result<f64, String> {
     number_within(text, f64::MIN_POSITIVE..=MAX_HZ, &wanted)
 }
 
-/// Runs it until a signal comes.
+/// Sends or receives until a signal arrives.
 pub fn run(common: &CommonArguments, arguments: &ZenohArguments) -> CommandResult {
     match &arguments.direction {
         Direction::Send(arguments) => run_send(common, arguments),
@@ -113,7 +113,7 @@ fn run_send(common: &CommonArguments, arguments: &SendArguments) -> CommandResul
 }
 
 fn run_receive(common: &CommonArguments, arguments: &ReceiveArguments) -> CommandResult {
-    // The name from the robot is part of a key: it must be one that an instance can have.
+    // The remote name is part of a key: it must be a valid name of an instance.
     Place::new(&arguments.from, "")?;
     let named = common.instance.clone();
     let instance = arguments.local.clone().or(named).unwrap_or_else(|| arguments.from.clone());
@@ -128,7 +128,7 @@ fn run_receive(common: &CommonArguments, arguments: &ReceiveArguments) -> Comman
     Ok(ExitCode::SUCCESS)
 }
 
-/// Says what an open port means.
+/// Warns about a port that others can reach.
 fn warn_of_open_port(endpoints: &Endpoints) {
     let open: Vec<String> =
         endpoints.listen.iter().filter(|e| !e.is_local()).map(Endpoint::to_string).collect();
@@ -136,9 +136,9 @@ fn warn_of_open_port(endpoints: &Endpoints) {
         return;
     }
     let who = match endpoints.password_file {
-        Some(_) => "who knows the password can read and write, and the network can listen",
+        Some(_) => "anyone with the password can read and write, and the traffic is not encrypted",
         None => {
-            "everybody who reaches it can read and write, and the network can listen (--password-file asks for a password)"
+            "anyone who reaches it can read and write, and the traffic is not encrypted (--password-file requires a password)"
         }
     };
     note(&format!("warning: {} is open beyond this machine: {who}", open.join(", ")));

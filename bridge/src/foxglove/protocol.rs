@@ -1,4 +1,4 @@
-//! The messages of the Foxglove WebSocket protocol: JSON, and a short header before binary ones.
+//! Messages of the Foxglove WebSocket protocol: JSON, and binary ones with a short header.
 
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -6,9 +6,9 @@ use serde_json::json;
 use crate::ros::schema::{full_name, schema};
 use crate::ros::topic::RosTopic;
 
-/// The kind of a binary message that holds data.
+/// Opcode of a binary message that carries data.
 const MESSAGE_DATA: u8 = 1;
-/// Bytes before the data: kind, subscription, time.
+/// Bytes before the data: opcode, subscription, time.
 const HEADER_BYTES: usize = 1 + 4 + 8;
 
 #[derive(Serialize)]
@@ -28,21 +28,21 @@ struct ChannelInfo {
     schema_encoding: &'static str,
 }
 
-/// What a client asks for.
+/// A request of a client.
 #[derive(Debug, PartialEq, Eq, Deserialize)]
 #[serde(tag = "op", rename_all = "camelCase", rename_all_fields = "camelCase")]
 pub enum Request {
-    /// To be sent channels.
+    /// Subscribe to channels.
     Subscribe {
-        /// Which ones.
+        /// The new subscriptions.
         subscriptions: Vec<Subscription>,
     },
-    /// The end of subscriptions.
+    /// End subscriptions.
     Unsubscribe {
-        /// Their numbers.
+        /// Their ids.
         subscription_ids: Vec<u32>,
     },
-    /// What is not offered.
+    /// Any other operation, which is not offered.
     #[serde(other)]
     Other,
 }
@@ -51,13 +51,13 @@ pub enum Request {
 #[derive(Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Subscription {
-    /// Its number, which the client chooses.
+    /// Id chosen by the client.
     pub id: u32,
     /// Number of the channel.
     pub channel_id: u32,
 }
 
-/// The first message to a client of `instance`; clients that see another session forget what they had.
+/// The first message to a client of `instance`; a client that sees a new session discards its state.
 pub fn server_info(instance: &str, session: i64) -> String {
     let info = json!({
         "op": "serverInfo",
@@ -70,7 +70,7 @@ pub fn server_info(instance: &str, session: i64) -> String {
     info.to_string()
 }
 
-/// The channels, numbered by their place.
+/// Advertises the channels, numbered by index.
 pub fn advertisement(topics: &[&RosTopic], instance: &str) -> String {
     let channel = |(id, topic): (usize, &&RosTopic)| ChannelInfo {
         id,
@@ -82,16 +82,16 @@ pub fn advertisement(topics: &[&RosTopic], instance: &str) -> String {
     };
     let channels = topics.iter().enumerate().map(channel).collect();
     let advertisement = Advertisement { op: "advertise", channels };
-    // What is written here always can be.
+    // Serialising this structure cannot fail.
     serde_json::to_string(&advertisement).unwrap_or_default()
 }
 
-/// A remark that a client shows, as a warning: level 1 of 0 to 2.
+/// A status message that the client shows as a warning: level 1 of 0 to 2.
 pub fn warning(message: &str) -> String {
     json!({ "op": "status", "level": 1, "message": message }).to_string()
 }
 
-/// Data for a subscription.
+/// A data message for a subscription.
 pub fn message_frame(subscription: u32, realtime_nanos: i64, data: &[u8]) -> Vec<u8> {
     let mut frame = Vec::with_capacity(HEADER_BYTES + data.len());
     frame.push(MESSAGE_DATA);
@@ -101,9 +101,9 @@ pub fn message_frame(subscription: u32, realtime_nanos: i64, data: &[u8]) -> Vec
     frame
 }
 
-/// What a client's text asks for, or why it is not understood.
+/// Parses a client's text, or explains why it is not understood.
 pub fn parse_request(text: &str) -> Result<Request, String> {
-    serde_json::from_str(text).map_err(|error| format!("a message was not understood: {error}"))
+    serde_json::from_str(text).map_err(|error| format!("invalid message: {error}"))
 }
 
 #[cfg(test)]
@@ -112,7 +112,7 @@ mod tests {
     use crate::ros::topic::ODOMETRY;
 
     #[test]
-    fn requests_are_understood_and_others_are_errors() {
+    fn requests_are_parsed_and_others_are_errors() {
         let subscribe = r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":1}]}"#;
         let subscriptions = vec![Subscription { id: 7, channel_id: 1 }];
         assert_eq!(parse_request(subscribe), Ok(Request::Subscribe { subscriptions }));

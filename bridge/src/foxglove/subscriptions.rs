@@ -1,49 +1,49 @@
-//! Which channels a client is subscribed to.
+//! Channels to which a client is subscribed.
 
-/// Most subscriptions of a client: some to each channel.
+/// Upper limit for the subscriptions of a client: several for each channel.
 const MOST: usize = 64;
 
-/// The subscriptions of a client, whose numbers it chooses.
+/// The subscriptions of a client, which chooses their ids.
 #[derive(Debug)]
 pub struct Subscriptions {
     num_channels: usize,
-    /// Number and channel of each.
+    /// Id and channel of each.
     all: Vec<(u32, usize)>,
 }
 
 impl Subscriptions {
-    /// None yet, to channels 0 to `num_channels`.
+    /// No subscriptions yet; channels are numbered below `num_channels`.
     pub fn new(num_channels: usize) -> Self {
         Self { num_channels, all: Vec::new() }
     }
 
-    /// Adds one and gives its channel, or says why not.
+    /// Adds a subscription and returns its channel, or the reason for refusing it.
     pub fn add(&mut self, subscription: u32, channel: u32) -> Result<usize, String> {
         let known = usize::try_from(channel).ok().filter(|channel| *channel < self.num_channels);
         let Some(channel) = known else {
             return Err(format!("there is no channel {channel}"));
         };
         if self.all.iter().any(|(id, _)| *id == subscription) {
-            return Err(format!("there is a subscription {subscription} already"));
+            return Err(format!("subscription {subscription} already exists"));
         }
         if self.all.len() >= MOST {
-            return Err(format!("a client can have {MOST} subscriptions"));
+            return Err(format!("a client can have at most {MOST} subscriptions"));
         }
         self.all.push((subscription, channel));
         Ok(channel)
     }
 
-    /// Removes one, if it is there.
+    /// Removes a subscription if it exists.
     pub fn remove(&mut self, subscription: u32) {
         self.all.retain(|(id, _)| *id != subscription);
     }
 
-    /// Whether anything is subscribed to a channel.
+    /// Whether a channel has a subscription.
     pub fn has(&self, channel: usize) -> bool {
         self.all.iter().any(|(_, subscribed)| *subscribed == channel)
     }
 
-    /// Numbers of the subscriptions to a channel.
+    /// Ids of the subscriptions to a channel.
     pub fn of(&self, channel: usize) -> impl Iterator<Item = u32> {
         self.all.iter().filter(move |(_, subscribed)| *subscribed == channel).map(|(id, _)| *id)
     }

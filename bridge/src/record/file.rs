@@ -1,4 +1,4 @@
-//! One MCAP file: written chunk by chunk, so that whatever ends the process leaves all but the last second.
+//! One MCAP file, written in chunks so that at most the last second is lost however the process ends.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
@@ -14,45 +14,45 @@ use crate::ros::encoder::{EncodeError, Encoded, Sink};
 use crate::ros::schema::{full_name, schema, type_hash};
 use crate::ros::topic::RosTopic;
 
-/// A chunk is written when its first message is so old: what a kill may cost.
+/// A chunk is written once its first message is this old: the most that a kill may cost.
 const CHUNK_PERIOD: Duration = Duration::from_secs(1);
-/// Or when it has so many bytes: memory, and what a reader must load for one message.
+/// Or once it has this many bytes, which bounds memory and what a reader must load for one message.
 const CHUNK_BYTES: u64 = 4 << 20;
 
 /// Why recording ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// The file exists, or cannot be made.
-    #[error("{}: cannot be made: {source}; name another file with --output", path.display())]
+    /// The file exists, or cannot be created.
+    #[error("{}: cannot be created: {source}; name another file with --output", path.display())]
     Create {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
     /// Writing failed.
-    #[error("{}: cannot be written: {source}; what was recorded before can be read", path.display())]
+    #[error("{}: cannot be written: {source}; what was recorded before remains readable", path.display())]
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The writer's error.
         source: McapError,
     },
-    /// A topic without a definition.
+    /// A message type without a definition.
     #[error("the type {0} has no definition")]
     Type(&'static str),
-    /// A message.
+    /// A message could not be encoded.
     #[error(transparent)]
     Encode(#[from] EncodeError),
 }
 
-/// An MCAP file that is being written.
+/// An MCAP file being written.
 pub struct RecordingFile {
-    /// Where it is.
+    /// Path of the file.
     pub path: PathBuf,
     instance: String,
     writer: Writer<BufWriter<File>>,
-    /// Channel of each topic, and messages in it.
+    /// Channel of each topic, and the number of messages in it.
     channels: HashMap<&'static str, (u16, u32)>,
     /// When the open chunk got its first message.
     chunk_began: Option<Instant>,
@@ -61,11 +61,11 @@ pub struct RecordingFile {
 }
 
 impl RecordingFile {
-    /// Makes a new file; one that exists is not touched.
+    /// Creates a new file; an existing one is left untouched.
     pub fn create(path: &Path, instance: &str) -> Result<Self, RecordError> {
         let create = |source| RecordError::Create { path: path.to_owned(), source };
         let file = File::options().write(true).create_new(true).open(path).map_err(create)?;
-        // Chunks are gathered in memory: a length that is filled in later would be missing after a kill.
+        // Chunks are assembled in memory: a length filled in later would be missing after a kill.
         let options = WriteOptions::new()
             .profile("ros2")
             .library(concat!("semidense ", env!("CARGO_PKG_VERSION")))
@@ -74,8 +74,8 @@ impl RecordingFile {
             .disable_seeking(true);
         let failed = |source| RecordError::Write { path: path.to_owned(), source };
         let mut writer = options.create(BufWriter::new(file)).map_err(failed)?;
-        // By it `rosbag2` knows that the quality of service is noted in numbers; first, so that a recording without end
-        // has it too.
+        // Tells `rosbag2` that quality of service is stored as numbers; written first, so that a truncated
+        // recording has it too.
         let metadata = BTreeMap::from([
             ("serialized_metadata".to_owned(), String::new()),
             ("ROS_DISTRO".to_owned(), "humble".to_owned()),
@@ -92,7 +92,7 @@ impl RecordingFile {
         })
     }
 
-    /// Messages so far, by the topic's name.
+    /// Number of messages so far, by topic name.
     pub fn counts(&self) -> impl Iterator<Item = (&'static str, u32)> {
         self.channels.iter().map(|(name, (_, count))| (*name, *count))
     }
@@ -101,7 +101,7 @@ impl RecordingFile {
         RecordError::Write { path: self.path.clone(), source }
     }
 
-    /// Makes the channel of a topic.
+    /// Adds the channel of a topic.
     fn add_channel(&mut self, topic: &RosTopic) -> Result<u16, RecordError> {
         let text = schema(topic.message_type).ok_or(RecordError::Type(topic.message_type))?;
         let type_name = full_name(topic.message_type);
@@ -115,7 +115,7 @@ impl RecordingFile {
         channel.map_err(|source| self.failed(source))
     }
 
-    /// Writes the open chunk where it is old enough.
+    /// Writes the open chunk if it is old enough.
     fn write_old_chunk(&mut self) -> Result<(), RecordError> {
         let began = *self.chunk_began.get_or_insert_with(Instant::now);
         if began.elapsed() < CHUNK_PERIOD {
@@ -125,7 +125,7 @@ impl RecordingFile {
         self.writer.flush().map_err(|source| self.failed(source))
     }
 
-    /// Writes what is left, and the index.
+    /// Writes the remaining messages and the index.
     pub fn finish(mut self) -> Result<(), RecordError> {
         let end = || -> Result<(), McapError> {
             self.writer.finish()?;

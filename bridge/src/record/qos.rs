@@ -1,13 +1,13 @@
-//! The quality of service of a topic as `rosbag2` notes it in a recording, so that `ros2 bag play` offers the same.
+//! A topic's quality of service as `rosbag2` stores it in a recording, so that `ros2 bag play` offers the same.
 
 use crate::ros::topic::{Durability, Reliability, RosTopic};
 
-/// The note of a topic, YAML, with the numbers of `rmw`'s enumerations. Distributions since Jazzy write names, and read
-/// numbers where the recording has a metadata record `rosbag2` without a version of its own.
+/// The profile of a topic as YAML, with the numbers of `rmw`'s enumerations. Distributions since Jazzy write
+/// names, and read numbers if the recording has a metadata record `rosbag2` without its own version.
 pub fn offered_qos_profiles(topic: &RosTopic) -> String {
-    /// `rmw`'s numbers: keep the last messages.
+    /// `rmw`'s number for keeping the last messages.
     const KEEP_LAST: u32 = 1;
-    /// Liveliness by the middleware itself.
+    /// `rmw`'s number for liveliness asserted by the middleware.
     const AUTOMATIC: u32 = 1;
     let reliability = match topic.reliability {
         Reliability::Reliable => 1,

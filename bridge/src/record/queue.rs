@@ -1,4 +1,4 @@
-//! A queue of events that never holds up whoever fills it: it has room for a number of bytes, and what does not fit is
+//! A queue of events that never delays its producer: its capacity is in bytes, and what does not fit is
 //! dropped and counted.
 
 use std::sync::Arc;
@@ -10,48 +10,48 @@ use semidense::slam::keyframe::DepthPoint;
 use crate::ros::encoder::Moment;
 use crate::session::Event;
 
-/// Events in the queue: what is not an image is small, and comes some hundred times a second.
+/// Capacity in events: those other than images are small and arrive a few hundred times a second.
 const MAX_EVENTS: usize = 4096;
 
-/// What came and went.
+/// Counters of a queue.
 #[derive(Debug, Default)]
 pub struct QueueCounts {
-    /// Bytes that wait.
+    /// Bytes in the queue.
     pub bytes: AtomicU64,
-    /// Images that were dropped.
+    /// Dropped images.
     pub dropped_images: AtomicU64,
-    /// Other messages that were dropped.
+    /// Other dropped messages.
     pub dropped_messages: AtomicU64,
 }
 
 impl QueueCounts {
-    /// All that was dropped.
+    /// All dropped messages.
     pub fn dropped(&self) -> u64 {
         self.dropped_images.load(Ordering::Relaxed) + self.dropped_messages.load(Ordering::Relaxed)
     }
 }
 
-/// An event and when it was read.
+/// An event and the time it was read.
 pub type Stamped = (Moment, Event);
 
-/// The end that is filled.
+/// The producer's end.
 #[derive(Debug)]
 pub struct QueueSender {
     sender: SyncSender<Stamped>,
-    /// What came and went.
+    /// Counters of the queue.
     pub counts: Arc<QueueCounts>,
     capacity_bytes: u64,
 }
 
-/// The end that is emptied.
+/// The consumer's end.
 #[derive(Debug)]
 pub struct QueueReceiver {
     receiver: Receiver<Stamped>,
-    /// What came and went.
+    /// Counters of the queue.
     pub counts: Arc<QueueCounts>,
 }
 
-/// A queue with room for `capacity_bytes`.
+/// Creates a queue with room for `capacity_bytes`.
 pub fn queue(capacity_bytes: u64) -> (QueueSender, QueueReceiver) {
     let (sender, receiver) = sync_channel(MAX_EVENTS);
     let counts = Arc::new(QueueCounts::default());
@@ -59,7 +59,7 @@ pub fn queue(capacity_bytes: u64) -> (QueueSender, QueueReceiver) {
     (sender, QueueReceiver { receiver, counts })
 }
 
-/// Memory that an event holds.
+/// Memory held by an event.
 fn bytes_of(event: &Event) -> u64 {
     let bytes = match event {
         Event::Frame(frame) => frame.pixels.len(),
@@ -67,7 +67,7 @@ fn bytes_of(event: &Event) -> u64 {
             keyframe.image.len() + keyframe.points.len() * size_of::<DepthPoint>()
         }
         Event::Graph(graph) => size_of_val(&graph.poses[..]),
-        // A message of a kilobyte or two.
+        // A message of one or two kilobytes.
         Event::Pose(_) | Event::Health(..) => 2048,
         Event::Joined | Event::Left | Event::Adjustment(_) => 0,
     };
@@ -75,7 +75,7 @@ fn bytes_of(event: &Event) -> u64 {
 }
 
 impl QueueSender {
-    /// Puts an event in, or drops and counts it. False once nobody empties the queue any more.
+    /// Puts an event in, or drops and counts it. False once the receiver is gone.
     pub fn put(&self, moment: Moment, event: Event) -> bool {
         let bytes = bytes_of(&event);
         let is_image = matches!(event, Event::Frame(_));
@@ -104,7 +104,7 @@ impl QueueSender {
 }
 
 impl QueueReceiver {
-    /// The next event; `None` once the queue is empty and nobody fills it any more.
+    /// The next event; `None` once the queue is empty and the sender is gone.
     pub fn take(&self) -> Option<Stamped> {
         let (moment, event) = self.receiver.recv().ok()?;
         self.counts.bytes.fetch_sub(bytes_of(&event), Ordering::Relaxed);

@@ -1,4 +1,4 @@
-//! The thread that writes what was queued, into one file or several.
+//! The thread that writes queued events to one or several files.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,29 +13,29 @@ use crate::ros::message::{DiagnosticArray, Time};
 use crate::ros::topic::DIAGNOSTICS;
 use crate::session::Event;
 
-/// What is recorded, and where.
+/// Settings of a recording.
 #[derive(Debug, Clone)]
 pub struct RecordParams {
     /// The file, or the first of several.
     pub output: PathBuf,
     /// The instance.
     pub instance: String,
-    /// How images are written.
+    /// Format of the images.
     pub images: ImageFormat,
-    /// A new file is begun when one has so many bytes.
+    /// A new file is started once one has this many bytes.
     pub max_bytes: Option<u64>,
-    /// A new file is begun when one is so long.
+    /// A new file is started once one is this long.
     pub max_duration: Option<Duration>,
 }
 
-/// What was recorded.
+/// Summary of a finished recording.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RecordSummary {
     /// The files.
     pub files: Vec<PathBuf>,
     /// Bytes of messages.
     pub bytes: u64,
-    /// Messages by the topic's name.
+    /// Number of messages by topic name.
     pub messages: BTreeMap<&'static str, u64>,
 }
 
@@ -48,7 +48,7 @@ pub struct Recorder {
     summary: RecordSummary,
 }
 
-/// The name of the file with this number: `run.mcap`, `run_1.mcap`, …
+/// Path of the file with this number: `run.mcap`, `run_1.mcap`, …
 fn numbered(path: &Path, number: usize) -> PathBuf {
     if number == 0 {
         return path.to_owned();
@@ -63,7 +63,7 @@ fn numbered(path: &Path, number: usize) -> PathBuf {
 }
 
 impl Recorder {
-    /// Makes the file.
+    /// Creates the file.
     pub fn create(params: RecordParams) -> Result<Self, RecordError> {
         let file = RecordingFile::create(&params.output, &params.instance)?;
         let encoder = EventEncoder::new(&params.instance, params.images);
@@ -71,7 +71,7 @@ impl Recorder {
         Ok(Self { params, encoder, file, began: Instant::now(), summary })
     }
 
-    /// Writes what comes until nobody fills the queue any more.
+    /// Writes events until the queue's sender is gone.
     pub fn run(mut self, queue: &QueueReceiver) -> Result<RecordSummary, RecordError> {
         while let Some((moment, event)) = queue.take() {
             self.write(&event, moment, &queue.counts)?;
@@ -90,7 +90,7 @@ impl Recorder {
         counts: &QueueCounts,
     ) -> Result<(), RecordError> {
         self.encoder.put(event, moment, &mut self.file)?;
-        // Once a second, with the pipeline's own health.
+        // Once a second, together with the pipeline's health.
         if matches!(event, Event::Health("capture", _)) {
             let stamp = Time::from_nanos(moment.realtime_nanos);
             let status = own_status(&self.params.instance, stamp, counts, self.file.bytes);
@@ -123,7 +123,7 @@ impl Recorder {
     }
 }
 
-/// How recording itself is doing.
+/// State of the recording itself.
 fn own_status(
     instance: &str,
     stamp: Time,
@@ -132,7 +132,8 @@ fn own_status(
 ) -> DiagnosticArray {
     use std::sync::atomic::Ordering::Relaxed;
     let dropped = counts.dropped();
-    let message = if dropped == 0 { "recording" } else { "dropped what came too fast" };
+    let message =
+        if dropped == 0 { "recording" } else { "messages were dropped: they arrived too fast" };
     let verdict = (u8::from(dropped > 0), message.to_owned());
     let values = vec![
         figure("dropped_images", counts.dropped_images.load(Relaxed)),
@@ -148,7 +149,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_are_numbered_before_their_ending() {
+    fn file_numbers_precede_the_extension() {
         assert_eq!(numbered(Path::new("a/run.mcap"), 0), Path::new("a/run.mcap"));
         assert_eq!(numbered(Path::new("a/run.mcap"), 2), Path::new("a/run_2.mcap"));
         assert_eq!(numbered(Path::new("run"), 1), Path::new("run_1"));

@@ -1,16 +1,16 @@
-//! Our axes and ROS's, and the covariance of a pose in them.
+//! Conversion from our axes to ROS's, for poses and their covariances.
 //!
-//! Ours are those of the first camera: x right, y down, z forward. The frames `map` and `odom` have REP 103's: x
-//! forward, y left, z up. Both are as the first camera stood: `z` is up as far as that looked straight ahead. Lengths
-//! are map units. A camera keeps its own axes, which in ROS are those of an optical frame.
+//! Ours are those of the first camera: x right, y down, z forward. The frames `map` and `odom` follow REP
+//! 103: x forward, y left, z up. Both take their orientation from the first camera: `z` is up only as far as
+//! that was level. Lengths are in map units. A camera keeps its own axes, which ROS calls an optical frame.
 
 use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector3, Vector6};
 use semidense::slam::geometry::se3::SE3;
 
 use crate::ros::message;
 
-/// The rotation to REP 103's axes from ours: x forward is our z, y left our -x, z up our -y. As a quaternion it is
-/// exact, so a pose keeps all its digits.
+/// The rotation from our axes to REP 103's: x forward is our z, y left our -x, z up our -y. As a quaternion
+/// it is exact, so a pose keeps all its digits.
 pub fn ros_from_world() -> SE3 {
     let half = 0.5;
     let quaternion = nalgebra::Quaternion::new(half, -half, half, -half);
@@ -35,7 +35,7 @@ pub fn vector_message(vector: &Vector3<f64>) -> message::Vector3 {
     message::Vector3 { x: vector.x, y: vector.y, z: vector.z }
 }
 
-/// The matrix of an upper triangle, row-major.
+/// The symmetric matrix with this upper triangle, row-major.
 fn matrix(upper: &[f64; 21]) -> Matrix6<f64> {
     let mut entries = upper.iter();
     let mut matrix = Matrix6::zeros();
@@ -49,13 +49,13 @@ fn matrix(upper: &[f64; 21]) -> Matrix6<f64> {
     matrix
 }
 
-/// A covariance as ROS has it: row-major. Symmetric to the last digit, as a filter may check.
+/// A covariance in ROS's layout: row-major. Exactly symmetric, as a filter may check.
 fn row_major(covariance: &Matrix6<f64>) -> [f64; 36] {
     let symmetric = (covariance + covariance.transpose()) * 0.5;
     std::array::from_fn(|at| symmetric[(at / 6, at % 6)])
 }
 
-/// Six numbers, two of three axes each, each turned by `rotation`.
+/// Rotates both three-vectors of a six-vector by `rotation`.
 fn both_turned(rotation: &Matrix3<f64>) -> Matrix6<f64> {
     let mut both = Matrix6::zeros();
     both.fixed_view_mut::<3, 3>(0, 0).copy_from(rotation);
@@ -63,24 +63,24 @@ fn both_turned(rotation: &Matrix3<f64>) -> Matrix6<f64> {
     both
 }
 
-/// Covariance of position and fixed-axis rotation in our axes, of the covariance of the left increment ξ of a pose. That
-/// turns about the origin: a position p errs by ξ_t + ξ_ω × p.
+/// Covariance of position and fixed-axis rotation in our axes, from that of a pose's left increment ξ, which
+/// rotates about the origin: the error of a position p is ξ_t + ξ_ω × p.
 pub fn place_covariance(position: &Vector3<f64>, left_increment: &[f64; 21]) -> Matrix6<f64> {
     let mut error_from_increment = Matrix6::identity();
     error_from_increment.fixed_view_mut::<3, 3>(0, 3).copy_from(&-position.cross_matrix());
     error_from_increment * matrix(left_increment) * error_from_increment.transpose()
 }
 
-/// The same in `map`, of the left increment of `map_from_camera`.
+/// The same in `map`, from the left increment of `map_from_camera`.
 pub fn map_covariance(map_from_camera: &SE3, left_increment: &[f64; 21]) -> [f64; 36] {
     let turned = both_turned(&ros_from_world().rotation_matrix());
     let covariance = place_covariance(&map_from_camera.translation, left_increment);
     row_major(&(turned * covariance * turned.transpose()))
 }
 
-/// Covariance of position and fixed-axis rotation in `odom`, of the covariance of the left increment ξ of
-/// `current_from_keyframe`, whose translation is in keyframe units: `unit` in the world. The camera then stands at
-/// `world_from_camera · exp(-ξ)`. The place of the keyframe itself, and so drift, is not in it.
+/// Covariance of position and fixed-axis rotation in `odom`, from that of the left increment ξ of
+/// `current_from_keyframe`, whose translation is in keyframe units of `unit` in the world. The pose of the camera is
+/// then `world_from_camera · exp(-ξ)`. The error of the keyframe's own pose, and hence drift, is not included.
 pub fn odometry_covariance(
     world_from_camera: &SE3,
     unit: f64,
@@ -88,12 +88,12 @@ pub fn odometry_covariance(
 ) -> [f64; 36] {
     let ros_from_camera = (ros_from_world() * *world_from_camera).rotation_matrix();
     let scale = Vector6::new(unit, unit, unit, 1.0, 1.0, 1.0);
-    // The sign of the increment does not matter to its covariance.
+    // The sign of the increment does not affect its covariance.
     let jacobian = both_turned(&ros_from_camera) * Matrix6::from_diagonal(&scale);
     row_major(&(jacobian * matrix(left_increment) * jacobian.transpose()))
 }
 
-/// The covariance of velocities in the camera's axes, linear then angular: only its form changes.
+/// The covariance of velocities in the camera's axes, linear then angular: only its layout changes.
 pub fn velocity_covariance(upper: &[f64; 21]) -> [f64; 36] {
     row_major(&matrix(upper))
 }
@@ -102,7 +102,7 @@ pub fn velocity_covariance(upper: &[f64; 21]) -> [f64; 36] {
 mod tests {
     use super::*;
 
-    /// A covariance without symmetries of its own.
+    /// A covariance without symmetry between axes.
     fn covariance() -> ([f64; 21], Matrix6<f64>) {
         let root = Matrix6::from_fn(|r, c| ((r * 7 + c * 3) % 5) as f64 * 0.3 - 0.4);
         let full = root * root.transpose() + Matrix6::identity() * 0.1;
@@ -115,8 +115,8 @@ mod tests {
         SE3::exp(&Vector6::new(3.0, -2.0, 5.0, 0.4, -0.9, 0.3))
     }
 
-    /// What ROS measures between two poses: position, and the rotation about fixed axes that takes one orientation to
-    /// the other.
+    /// The error between two poses as ROS defines it: position, and the rotation about fixed axes that takes
+    /// one orientation to the other.
     fn ros_error(from: &SE3, to: &SE3) -> Vector6<f64> {
         let (from, to) = (ros_from_world() * *from, ros_from_world() * *to);
         let position = to.translation - from.translation;
@@ -124,7 +124,7 @@ mod tests {
         Vector6::new(position.x, position.y, position.z, rotation.x, rotation.y, rotation.z)
     }
 
-    /// The covariance in ROS of `full`, by differences: `moved` is the pose after an increment.
+    /// The covariance in ROS of `full`, by finite differences: `moved` is the pose after an increment.
     fn by_differences(moved: impl Fn(&Vector6<f64>) -> SE3, full: &Matrix6<f64>) -> Matrix6<f64> {
         const STEP: f64 = 1e-6;
         let mut jacobian = Matrix6::zeros();
@@ -153,14 +153,14 @@ mod tests {
     }
 
     #[test]
-    fn the_covariance_in_the_map_is_that_of_small_displacements() {
+    fn the_covariance_in_the_map_matches_finite_differences() {
         let (upper, full) = covariance();
         let expected = by_differences(|xi| SE3::exp(xi) * somewhere(), &full);
         assert_same(&map_covariance(&somewhere(), &upper), &expected);
     }
 
     #[test]
-    fn the_covariance_of_odometry_is_that_of_small_displacements() {
+    fn the_covariance_of_odometry_matches_finite_differences() {
         const UNIT: f64 = 2.5;
         let (upper, full) = covariance();
         let world_from_keyframe = SE3::exp(&Vector6::new(-1.0, 2.0, 0.5, -0.7, 0.2, 1.1));

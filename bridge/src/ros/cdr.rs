@@ -1,4 +1,4 @@
-//! Messages as bytes: CDR, version 1, as ROS 2 has it on every wire and in every recording.
+//! Encodes messages as CDR, version 1, the encoding of ROS 2 on the network and in recordings.
 
 use byteorder::{BigEndian, LittleEndian};
 use serde::Serialize;
@@ -10,34 +10,34 @@ const LITTLE_ENDIAN_HEADER: [u8; 4] = [0, 1, 0, 0];
 /// The header before a message in big endian.
 const BIG_ENDIAN: [u8; 2] = [0, 0];
 
-/// Why bytes are not this message.
+/// Why bytes cannot be decoded.
 #[derive(Debug, thiserror::Error)]
 pub enum DecodeError {
-    /// Fewer bytes than the header before a message.
+    /// Fewer bytes than the header of a message.
     #[error("has {0} bytes, fewer than the header of a message")]
     Short(usize),
-    /// Another encoding than plain CDR.
+    /// An encoding other than plain CDR.
     #[error("has the encoding {0:02x?}, which is not plain CDR")]
     Encoding([u8; 2]),
-    /// The bytes end early, or a value is not valid.
-    #[error("is not this message: {0}")]
+    /// The bytes end early, or a value is invalid.
+    #[error("is not a message of this type: {0}")]
     Content(#[from] cdr_encoding::Error),
 }
 
-/// Writes `message` in `bytes`, in place of what they had. Only a message longer than 4 GB, or one with a type that
-/// CDR does not have, fails.
+/// Encodes `message` into `bytes`, replacing their content. Fails only for a message longer than 4 GB, or one
+/// with a type that CDR does not have.
 pub fn encode_into<T: Serialize>(
     message: &T,
     bytes: &mut Vec<u8>,
 ) -> Result<(), cdr_encoding::Error> {
     bytes.clear();
     bytes.extend_from_slice(&LITTLE_ENDIAN_HEADER);
-    // Numbers are aligned from the end of the header on, so the writer must not see it.
+    // Numbers are aligned relative to the end of the header, so the writer must not see it.
     cdr_encoding::to_writer::<T, LittleEndian, _>(bytes, message)
 }
 
-/// The message of `bytes`, in either byte order. Sizes in it are never trusted: nothing is allocated beyond the bytes
-/// there are.
+/// Decodes a message in either byte order. Sizes in it are never trusted: nothing is allocated beyond the
+/// available bytes.
 pub fn decode<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, DecodeError> {
     let Some((header, content)) = bytes.split_at_checked(LITTLE_ENDIAN_HEADER.len()) else {
         return Err(DecodeError::Short(bytes.len()));
@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_are_aligned_from_the_end_of_the_header() {
+    fn numbers_are_aligned_relative_to_the_end_of_the_header() {
         let bytes = encode(&image());
         #[rustfmt::skip]
         let expected = [
@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn both_byte_orders_are_read_and_hostile_bytes_are_errors() {
+    fn both_byte_orders_are_read_and_malformed_bytes_are_errors() {
         let mut big = vec![0, 0, 0, 0];
         cdr_encoding::to_writer::<_, BigEndian, _>(&mut big, &image()).unwrap();
         assert_eq!(decode::<Image>(&big).unwrap(), image());
@@ -98,7 +98,7 @@ mod tests {
         for length in 0..whole.len() {
             assert!(decode::<Image>(&whole[..length]).is_err(), "{length} bytes");
         }
-        // A length of 4 GB with six bytes behind it.
+        // A length of 4 GB followed by six bytes.
         let mut hostile = whole.clone();
         let at = whole.len() - 10;
         hostile[at..at + 4].fill(0xff);

@@ -1,4 +1,4 @@
-//! From what a session reads to ROS's messages.
+//! Converts a session's events to ROS messages.
 
 use std::collections::HashMap;
 
@@ -19,10 +19,10 @@ use crate::ros::message::{
 };
 use crate::session::{Event, Frame, Graph, Pose};
 
-/// Variance of a velocity that is not known: so large that filters, which do not know of a mark for it, leave it alone.
+/// Variance of an unknown velocity: so large that filters, which have no marker for unknown, ignore it.
 const UNKNOWN_VARIANCE: f64 = 1e6;
 
-/// The messages of a pose that is claimed.
+/// The messages of a claimed pose.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PoseMessages {
     /// The best estimate, in the map.
@@ -33,25 +33,25 @@ pub struct PoseMessages {
     pub transforms: TfMessage,
 }
 
-/// Makes ROS's messages of one instance. It must see every event, in order, by [`Converter::observe`].
+/// Converts the events of one instance. It must see every event, in order, through [`Converter::observe`].
 #[derive(Debug, Clone)]
 pub struct Converter {
     instance: String,
     frames: FrameIds,
     /// The unit of each keyframe in the world.
     units: HashMap<u64, f64>,
-    /// From the stamps of frames to CLOCK_REALTIME, nanoseconds; 0 where unknown.
+    /// Offset from frame stamps to CLOCK_REALTIME, nanoseconds; 0 if unknown.
     realtime_from_capture: i64,
 }
 
 impl Converter {
-    /// For an instance, with its frames' names.
+    /// A converter for an instance, with the names of its frames.
     pub fn new(instance: &str, frames: FrameIds) -> Self {
         let instance = instance.to_owned();
         Self { instance, frames, units: HashMap::new(), realtime_from_capture: 0 }
     }
 
-    /// Takes what later messages need: units of keyframes, clocks.
+    /// Stores what later messages need: units of keyframes, clocks.
     pub fn observe(&mut self, event: &Event) {
         match event {
             Event::Joined => {
@@ -61,8 +61,8 @@ impl Converter {
             Event::Keyframe(keyframe) => {
                 self.units.insert(keyframe.keyframe_id, keyframe.world_from_keyframe.scale);
             }
-            // Of keyframes from before the session only the map's unit is known, which is the world's but for the
-            // corrections of the scale since.
+            // For keyframes from before the session only the map's unit is known, which equals the world's
+            // except for corrections of the scale since.
             Event::Graph(graph) => graph.poses.iter().for_each(|pose| {
                 self.units.entry(pose.keyframe_id).or_insert(pose.map_from_keyframe.scale);
             }),
@@ -82,12 +82,12 @@ impl Converter {
         }
     }
 
-    /// The stamp of a frame in ROS: CLOCK_REALTIME of its exposure where known, else the stamp of its source.
+    /// The ROS stamp of a frame: CLOCK_REALTIME of its exposure if known, else the stamp of its source.
     pub fn stamp(&self, capture_nanos: i64) -> Time {
         Time::from_nanos(capture_nanos.saturating_add(self.realtime_from_capture))
     }
 
-    /// Stamp and frame of what the camera saw; `realtime_nanos` is 0 where unknown.
+    /// Stamp and frame id of a camera's message; `realtime_nanos` is 0 if unknown.
     fn camera_header(&self, capture_nanos: i64, realtime_nanos: i64) -> Header {
         let stamp = match realtime_nanos {
             0 => self.stamp(capture_nanos),
@@ -96,18 +96,18 @@ impl Converter {
         Header::new(stamp, &self.frames.camera)
     }
 
-    /// Stamp of a pose, and the frame of its camera.
+    /// Stamp of a pose, and the frame id of its camera.
     pub fn pose_header(&self, pose: &Pose) -> Header {
         self.camera_header(pose.message.capture_nanos, pose.message.realtime_nanos)
     }
 
-    /// A stamp in the map.
+    /// A header in the map.
     pub fn map_header(&self, stamp: Time) -> Header {
         Header::new(stamp, &self.frames.map)
     }
 
-    /// The messages of a pose; `None` where it is not claimed (initializing, lost), or on a keyframe whose unit is not
-    /// known yet.
+    /// The messages of a pose; `None` if it is not claimed (initializing, lost), or is on a keyframe whose
+    /// unit is not known yet.
     pub fn pose(&self, pose: &Pose) -> Option<PoseMessages> {
         let Pose { message, estimate } = pose;
         if !estimate.state.is_tracked() {
@@ -153,7 +153,7 @@ impl Converter {
         keyframe_cloud(keyframe, self.map_header(stamp))
     }
 
-    /// Poses of all keyframes in the map, in the order of their ids; `stamp` is when the graph was read.
+    /// Poses of all keyframes in the map, ordered by id; `stamp` is when the graph was read.
     pub fn keyframes(&self, graph: &Graph, stamp: Time) -> PoseArray {
         let place = |pose: &semidense::slam::keyframe::KeyframePose| {
             pose_message(&(ros_from_world() * pose.map_from_keyframe.rigid))
@@ -167,7 +167,7 @@ impl Converter {
         self.camera_header(frame.header.capture_nanos, frame.header.realtime_nanos)
     }
 
-    /// The image, as `mono8`.
+    /// The image as `mono8`.
     pub fn image(&self, frame: &Frame) -> Image {
         let FrameHeader { width, height, stride, .. } = frame.header;
         Image {
@@ -181,7 +181,7 @@ impl Converter {
         }
     }
 
-    /// The camera of the image: rectified, so without a lens.
+    /// The camera of the image: rectified, hence without a lens.
     pub fn camera_info(&self, frame: &Frame) -> CameraInfo {
         let FrameHeader { width, height, intrinsics: [fx, fy, cx, cy], .. } = frame.header;
         CameraInfo {

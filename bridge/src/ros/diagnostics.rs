@@ -1,4 +1,4 @@
-//! Health of a process as ROS's diagnostics.
+//! Health of a process as ROS diagnostics.
 
 use semidense::service::health::{ProcessState, cause, percentile_ms, source, warning};
 use semidense::slam::pose::TrackingState;
@@ -11,10 +11,10 @@ const WARN: u8 = 1;
 const ERROR: u8 = 2;
 const STALE: u8 = 3;
 
-/// How bad the states are that a last frame came to, by their codes in [`HealthMessage::detail`].
+/// Severity of the tracking status of the last frame, by its code in [`HealthMessage::detail`].
 const FRAME_LEVELS: [u8; 4] = [WARN, OK, WARN, ERROR];
 
-/// A report of one part of `instance`: its level and state in words, and figures.
+/// A report on one part of `instance`: its level and state in words, and figures.
 pub fn report(
     instance: &str,
     part: &str,
@@ -28,7 +28,7 @@ pub fn report(
     DiagnosticArray { header: Header::new(stamp, ""), status: vec![status] }
 }
 
-/// A figure of a report.
+/// A key and value of a report.
 pub fn figure(key: &str, value: impl ToString) -> KeyValue {
     KeyValue { key: key.to_owned(), value: value.to_string() }
 }
@@ -43,7 +43,7 @@ pub fn diagnostics(
     report(instance, owner, stamp, verdict(owner, health), figures(owner, health))
 }
 
-/// How bad it is, and what it is, in a few words.
+/// Severity and state in a few words.
 fn verdict(owner: &str, health: &HealthMessage) -> (u8, String) {
     let state = ProcessState::from_code(health.state);
     let (mut level, mut words) = match state {
@@ -68,7 +68,7 @@ fn verdict(owner: &str, health: &HealthMessage) -> (u8, String) {
     (level, words)
 }
 
-/// The figures of a process; NaN and what is unknown are left out.
+/// The figures of a process; NaN and unknown values are left out.
 fn figures(owner: &str, health: &HealthMessage) -> Vec<KeyValue> {
     let counts = [
         ("frames", health.frames),

@@ -1,4 +1,4 @@
-//! What a session reads as the bytes of ROS's messages, one topic at a time: for recordings and for Foxglove.
+//! Encodes a session's events as ROS messages, one topic at a time, for recordings and Foxglove.
 
 use std::time::Instant;
 
@@ -21,14 +21,14 @@ use crate::session::{Event, Frame, Graph, Pose};
 /// When an event was read.
 #[derive(Debug, Clone, Copy)]
 pub struct Moment {
-    /// For periods.
+    /// For measuring periods.
     pub instant: Instant,
     /// CLOCK_REALTIME, for stamps.
     pub realtime_nanos: i64,
 }
 
 impl Moment {
-    /// Now.
+    /// The current time.
     pub fn now() -> Self {
         Self { instant: Instant::now(), realtime_nanos: realtime_nanos() }
     }
@@ -40,20 +40,20 @@ pub fn realtime_nanos() -> i64 {
     i64::try_from(since_epoch.as_nanos()).unwrap_or(i64::MAX)
 }
 
-/// One message.
+/// One encoded message.
 #[derive(Debug, Clone, Copy)]
 pub struct Encoded<'a> {
     /// Its topic.
     pub topic: &'static RosTopic,
-    /// The stamp of what it tells.
+    /// The stamp of its content.
     pub stamp: Time,
-    /// CLOCK_REALTIME when that was read, nanoseconds.
+    /// CLOCK_REALTIME when the content was read, nanoseconds.
     pub read_nanos: i64,
-    /// Its bytes, with the header of CDR.
+    /// Its bytes, with the CDR header.
     pub bytes: &'a [u8],
 }
 
-/// Why there is no message.
+/// Why a message cannot be encoded.
 #[derive(Debug, thiserror::Error)]
 pub enum EncodeError {
     /// An image cannot be compressed.
@@ -64,38 +64,38 @@ pub enum EncodeError {
     Message(#[from] cdr_encoding::Error),
 }
 
-/// Whoever takes messages.
+/// A consumer of messages.
 pub trait Sink {
-    /// Why it cannot.
+    /// Why it cannot accept a message.
     type Error: From<EncodeError>;
 
-    /// Whether anybody wants this topic: what nobody wants is not encoded.
+    /// Whether this topic has a subscriber: topics without one are not encoded.
     fn wants(&self, topic: &'static RosTopic) -> bool;
 
     /// Takes a message.
     fn put(&mut self, message: Encoded<'_>) -> Result<(), Self::Error>;
 }
 
-/// Encodes the events of one instance, which it must see all of, in order.
+/// Encodes the events of one instance; it must see all of them, in order.
 #[derive(Debug)]
 pub struct EventEncoder {
     converter: Converter,
     images: ImageFormat,
     pace: KeyframePace,
-    /// CLOCK_REALTIME when what is put now was read.
+    /// CLOCK_REALTIME when the current event was read.
     read_nanos: i64,
     bytes: Vec<u8>,
 }
 
 impl EventEncoder {
-    /// For an instance.
+    /// An encoder for an instance.
     pub fn new(instance: &str, images: ImageFormat) -> Self {
         let converter = Converter::new(instance, FrameIds::of_instance(instance));
         let pace = KeyframePace::default();
         Self { converter, images, pace, read_nanos: 0, bytes: Vec::new() }
     }
 
-    /// Puts what an event is in ROS into `sink`.
+    /// Puts the messages of an event into `sink`.
     pub fn put<S: Sink>(
         &mut self,
         event: &Event,
@@ -121,13 +121,13 @@ impl EventEncoder {
         }
     }
 
-    /// Puts what was held back: at the end.
+    /// Puts pending messages into `sink`, at the end.
     pub fn finish<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
         self.read_nanos = realtime_nanos();
         self.put_waiting(sink)
     }
 
-    /// Puts what came rarely and before, for who comes late.
+    /// Puts the last rare messages into `sink`, for a late subscriber.
     pub fn put_last<S: Sink>(
         &mut self,
         keyframe: Option<&Keyframe>,
@@ -144,7 +144,7 @@ impl EventEncoder {
         waiting.map_or(Ok(()), |keyframe| self.put_keyframe(&keyframe, sink))
     }
 
-    /// Encodes the message that `make` gives and puts it into `sink`, where that wants the topic.
+    /// Encodes the message returned by `make` and puts it into `sink` if that wants the topic.
     pub fn offer<S: Sink, M: Serialize>(
         &mut self,
         topic: &'static RosTopic,

@@ -5,8 +5,8 @@ use semidense::slam::keyframe::Keyframe;
 use crate::ros::axes::ros_from_world;
 use crate::ros::message::{Header, PointCloud2, PointField};
 
-/// Fields of a point, each a 32-bit float: place in the map, REP 103's axes and map units; brightness 0 to 255; standard
-/// deviation along the line of sight, map units.
+/// Fields of a point, each a 32-bit float: position in the map, REP 103 axes and map units; brightness 0 to
+/// 255; standard deviation along the line of sight, map units.
 const FIELDS: [&str; 5] = ["x", "y", "z", "intensity", "sigma"];
 
 /// Bytes of a field.
@@ -15,7 +15,7 @@ const FIELD_BYTES: usize = size_of::<f32>();
 /// Bytes of a point.
 pub const POINT_BYTES: usize = FIELDS.len() * FIELD_BYTES;
 
-/// The points of a keyframe where the map has them. What has no depth is left out.
+/// The points of a keyframe, placed in the map. Points without depth are left out.
 pub fn keyframe_cloud(keyframe: &Keyframe, header: Header) -> PointCloud2 {
     let ros_from_keyframe = ros_from_world() * keyframe.map_from_keyframe.rigid;
     let (rotation, unit) = (ros_from_keyframe.rotation_matrix(), keyframe.map_from_keyframe.scale);
@@ -62,7 +62,7 @@ mod tests {
     use semidense::slam::keyframe::DepthPoint;
 
     #[test]
-    fn points_are_in_the_map_and_ahead_is_x() {
+    fn points_are_in_the_map_with_x_ahead() {
         let intrinsics =
             Intrinsics { fx: 100.0, fy: 100.0, cx: 50.0, cy: 40.0, width: 101, height: 81 };
         let point = |u, v, inverse_depth| DepthPoint {

@@ -1,15 +1,15 @@
-//! ROS 2's messages, field by field as their definitions have them.
+//! ROS 2 messages, with the fields of their definitions.
 
 use serde::{Deserialize, Serialize};
 use serde_big_array::BigArray;
 
 /// A message with a ROS type.
 pub trait RosMessage: Serialize {
-    /// Its type: package and name, as `nav_msgs/Odometry`.
+    /// Its type: package and name, such as `nav_msgs/Odometry`.
     const TYPE: &'static str;
 }
 
-/// `builtin_interfaces/Time`: an instant, of CLOCK_REALTIME where it is known.
+/// `builtin_interfaces/Time`: an instant, of CLOCK_REALTIME if known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Time {
     /// Seconds.
@@ -22,7 +22,7 @@ impl Time {
     /// Nanoseconds in a second.
     const SECOND: i64 = 1_000_000_000;
 
-    /// Of nanoseconds; what a `Time` cannot hold becomes its nearest end.
+    /// Converts from nanoseconds, saturating.
     pub fn from_nanos(nanos: i64) -> Self {
         let seconds = nanos.div_euclid(Self::SECOND);
         match i32::try_from(seconds) {
@@ -32,7 +32,7 @@ impl Time {
         }
     }
 
-    /// In nanoseconds.
+    /// Converts to nanoseconds.
     pub fn nanos(self) -> i64 {
         i64::from(self.sec) * Self::SECOND + i64::from(self.nanosec)
     }
@@ -41,14 +41,14 @@ impl Time {
 /// `std_msgs/Header`.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Header {
-    /// When what the message tells was.
+    /// Time of the message's content.
     pub stamp: Time,
-    /// The frame that its numbers are in.
+    /// The frame id of its coordinates.
     pub frame_id: String,
 }
 
 impl Header {
-    /// Of a stamp and a frame; empty where there is none.
+    /// A header with this stamp and frame id, which may be empty.
     pub fn new(stamp: Time, frame_id: &str) -> Self {
         Self { stamp, frame_id: frame_id.to_owned() }
     }
@@ -136,7 +136,7 @@ pub struct TwistWithCovariance {
 pub struct Odometry {
     /// Stamp, and the frame of the pose.
     pub header: Header,
-    /// The frame of the twist, and what the pose is the pose of.
+    /// The frame whose pose and twist this is; the twist is expressed in it.
     pub child_frame_id: String,
     /// The pose.
     pub pose: PoseWithCovariance,
@@ -162,12 +162,12 @@ pub struct Transform {
     pub rotation: Quaternion,
 }
 
-/// `geometry_msgs/TransformStamped`: where the child is in the header's frame.
+/// `geometry_msgs/TransformStamped`: the pose of the child frame in the header's frame.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TransformStamped {
-    /// Stamp and the parent.
+    /// Stamp and parent frame.
     pub header: Header,
-    /// The child.
+    /// The child frame.
     pub child_frame_id: String,
     /// `parent_from_child`.
     pub transform: Transform,
@@ -203,11 +203,11 @@ impl PointField {
 pub struct PointCloud2 {
     /// Stamp and frame of the points.
     pub header: Header,
-    /// Rows: 1 where the points have no order.
+    /// Rows: 1 for unordered points.
     pub height: u32,
     /// Points in a row.
     pub width: u32,
-    /// What a point has.
+    /// The fields of a point.
     pub fields: Vec<PointField>,
     /// Whether numbers are big endian.
     pub is_bigendian: bool,
@@ -231,7 +231,7 @@ pub struct Image {
     pub height: u32,
     /// Width, pixels.
     pub width: u32,
-    /// What a pixel is, as `mono8`.
+    /// Pixel format, such as `mono8`.
     pub encoding: String,
     /// Whether numbers are big endian.
     pub is_bigendian: u8,
@@ -249,7 +249,7 @@ pub struct CompressedImage {
     pub header: Header,
     /// `jpeg` or `png`.
     pub format: String,
-    /// The file.
+    /// The encoded file.
     #[serde(with = "serde_bytes")]
     pub data: Vec<u8>,
 }
@@ -288,18 +288,18 @@ pub struct CameraInfo {
     pub r: [f64; 9],
     /// Projection of the rectified image, row-major 3×4.
     pub p: [f64; 12],
-    /// Columns that one pixel is of, 0 for one.
+    /// Number of columns combined into one pixel; 0 means 1.
     pub binning_x: u32,
-    /// Rows that one pixel is of, 0 for one.
+    /// Number of rows combined into one pixel; 0 means 1.
     pub binning_y: u32,
-    /// The part of the sensor that the image is.
+    /// The part of the sensor that the image covers.
     pub roi: RegionOfInterest,
 }
 
 /// `diagnostic_msgs/KeyValue`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct KeyValue {
-    /// What it is, with its unit.
+    /// Name of the value, with its unit.
     pub key: String,
     /// Its value.
     pub value: String,
@@ -308,9 +308,9 @@ pub struct KeyValue {
 /// `diagnostic_msgs/DiagnosticStatus`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DiagnosticStatus {
-    /// 0 all right, 1 a warning, 2 an error, 3 nothing heard.
+    /// 0 OK, 1 warning, 2 error, 3 stale.
     pub level: u8,
-    /// Whose it is.
+    /// The component that reports.
     pub name: String,
     /// The state in a few words.
     pub message: String,
@@ -323,7 +323,7 @@ pub struct DiagnosticStatus {
 /// `diagnostic_msgs/DiagnosticArray`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DiagnosticArray {
-    /// When.
+    /// Time of the report.
     pub header: Header,
     /// One for each process.
     pub status: Vec<DiagnosticStatus>,

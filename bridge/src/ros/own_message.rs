@@ -1,5 +1,5 @@
-//! What ROS has no messages for: the numbers as they are in shared memory, so that nothing is lost. Recordings carry
-//! their definitions, by which every reader of `ros2msg` knows them. Poses are in our axes (x right, y down, z forward).
+//! Messages that ROS lacks: the values of shared memory without loss. Recordings carry their definitions,
+//! from which every reader of `ros2msg` decodes them. Poses are in our axes (x right, y down, z forward).
 
 use semidense::slam::keyframe::Keyframe;
 use semidense::wire::conversion::similarity_message;
@@ -10,7 +10,7 @@ use serde_big_array::BigArray;
 use crate::ros::message::Header;
 use crate::session::Graph;
 
-/// `semidense_msgs/Frame`: of an image what `sensor_msgs` has no place for. A recording is played with these stamps.
+/// `semidense_msgs/Frame`: properties of an image that `sensor_msgs` lacks. Replaying a recording uses these stamps.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FrameRecord {
     /// Stamp and frame of the image.
@@ -19,23 +19,23 @@ pub struct FrameRecord {
     pub sequence: u64,
     /// Its stamp, nanoseconds of the source's clock.
     pub capture_nanos: i64,
-    /// CLOCK_MONOTONIC instant that latency counts from.
+    /// CLOCK_MONOTONIC instant from which latency is measured.
     pub clock_nanos: i64,
-    /// Exposure time in nanoseconds, 0 where unknown.
+    /// Exposure time in nanoseconds, 0 if unknown.
     pub exposure_nanos: u64,
-    /// Sensor gain, 0 where unknown.
+    /// Sensor gain, 0 if unknown.
     pub gain: f32,
 }
 
 impl FrameRecord {
-    /// Of a frame's header.
+    /// Converts a frame's header.
     pub fn new(header: Header, frame: &FrameHeader) -> Self {
         let FrameHeader { sequence, capture_nanos, clock_nanos, exposure_nanos, gain, .. } = *frame;
         Self { header, sequence, capture_nanos, clock_nanos, exposure_nanos, gain }
     }
 }
 
-/// `semidense_msgs/Pose`: all of a pose, also of one that is not claimed.
+/// `semidense_msgs/Pose`: all fields of a pose, including one that is not claimed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PoseRecord {
     /// Stamp of the frame.
@@ -44,7 +44,7 @@ pub struct PoseRecord {
     pub sequence: u64,
     /// Stamp of the frame, nanoseconds of the source's clock.
     pub capture_nanos: i64,
-    /// From the frame's instant to publication.
+    /// Time from the frame's instant to publication.
     pub latency_nanos: u64,
     /// Time that tracking took.
     pub track_nanos: u64,
@@ -52,13 +52,13 @@ pub struct PoseRecord {
     pub keyframe_id: u64,
     /// Revision of its depth.
     pub revision: u64,
-    /// How often the map had been corrected.
+    /// Number of corrections of the map.
     pub map_revision: u64,
-    /// Life of the map.
+    /// Epoch of the map.
     pub epoch: u32,
     /// 0 initializing, 1 tracking, 2 degraded, 3 lost.
     pub state: u32,
-    /// Why, see `PoseMessage` in docs/topics.md.
+    /// The reason, see `PoseMessage` in docs/topics.md.
     pub reason: u32,
     /// Odometry: quaternion x, y, z, w, then translation.
     pub world_from_camera: [f64; 7],
@@ -66,26 +66,26 @@ pub struct PoseRecord {
     pub map_from_camera: [f64; 7],
     /// Relative to the keyframe, in its unit.
     pub keyframe_from_camera: [f64; 7],
-    /// Of the left increment of `current_from_keyframe`: upper triangle, row-major.
+    /// Covariance of the left increment of `current_from_keyframe`: upper triangle, row-major.
     #[serde(with = "BigArray")]
     pub covariance: [f64; 21],
-    /// Of the left increment of `map_from_camera`.
+    /// Covariance of the left increment of `map_from_camera`.
     #[serde(with = "BigArray")]
     pub map_covariance: [f64; 21],
-    /// 1 where the velocity is known.
+    /// 1 if the velocity is known.
     pub has_velocity: u32,
-    /// Of the camera, in its axes, world units a second.
+    /// Linear velocity of the camera in its own axes, world units per second.
     pub linear_velocity: [f64; 3],
-    /// Of the camera, in its axes, rad/s.
+    /// Angular velocity of the camera in its own axes, rad/s.
     pub angular_velocity: [f64; 3],
-    /// Linear, then angular: upper triangle, row-major.
+    /// Covariance of linear, then angular velocity: upper triangle, row-major.
     #[serde(with = "BigArray")]
     pub velocity_covariance: [f64; 21],
-    /// Brightness against the keyframe: a, b.
+    /// Brightness relative to the keyframe: a, b.
     pub brightness: [f64; 2],
     /// Share of the keyframe's points in view.
     pub in_view_ratio: f64,
-    /// Share of those compared that are explained.
+    /// Share of the compared points that are inliers.
     pub inlier_ratio: f64,
     /// Residual in grey levels.
     pub residual_rmse: f64,
@@ -96,7 +96,7 @@ pub struct PoseRecord {
 }
 
 impl PoseRecord {
-    /// Of a pose.
+    /// Converts a pose.
     pub fn new(header: Header, pose: &PoseMessage) -> Self {
         Self {
             header,
@@ -129,7 +129,7 @@ impl PoseRecord {
     }
 }
 
-/// `semidense_msgs/Keyframe`: what a keyframe has besides its points.
+/// `semidense_msgs/Keyframe`: the properties of a keyframe besides its points.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct KeyframeRecord {
     /// Stamp of its frame.
@@ -140,22 +140,22 @@ pub struct KeyframeRecord {
     pub revision: u64,
     /// Sequence of its frame.
     pub sequence: u64,
-    /// How often the map had been corrected.
+    /// Number of corrections of the map.
     pub map_revision: u64,
-    /// Life of the map.
+    /// Epoch of the map.
     pub epoch: u32,
     /// Points with depth.
     pub points: u32,
-    /// Where odometry has it: quaternion, translation, unit.
+    /// Pose in the odometry world: quaternion, translation, unit.
     pub world_from_keyframe: [f64; 8],
-    /// Where the map has it.
+    /// Pose in the map.
     pub map_from_keyframe: [f64; 8],
     /// fx, fy, cx, cy, pixels.
     pub intrinsics: [f64; 4],
 }
 
 impl KeyframeRecord {
-    /// Of a keyframe.
+    /// Converts a keyframe.
     pub fn new(header: Header, keyframe: &Keyframe) -> Self {
         let k = &keyframe.intrinsics;
         Self {
@@ -173,25 +173,25 @@ impl KeyframeRecord {
     }
 }
 
-/// `semidense_msgs/Graph`: poses of all keyframes with what a `PoseArray` has no place for.
+/// `semidense_msgs/Graph`: poses of all keyframes, with the properties that do not fit into a `PoseArray`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct GraphRecord {
     /// When it was read.
     pub header: Header,
-    /// How often the map had been corrected.
+    /// Number of corrections of the map.
     pub map_revision: u64,
-    /// Life of the map.
+    /// Epoch of the map.
     pub epoch: u32,
-    /// Keyframes.
+    /// Ids of the keyframes.
     pub keyframe_ids: Vec<u64>,
     /// Revision of the depth of each.
     pub revisions: Vec<u64>,
-    /// Where the map has each: eight numbers, quaternion, translation, unit.
+    /// Pose of each in the map: eight numbers, quaternion, translation, unit.
     pub map_from_keyframes: Vec<f64>,
 }
 
 impl GraphRecord {
-    /// Of a graph.
+    /// Converts a graph.
     pub fn new(header: Header, graph: &Graph) -> Self {
         let poses = graph.poses.iter();
         Self {

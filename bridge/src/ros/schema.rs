@@ -1,4 +1,4 @@
-//! The definitions of the messages, as recordings and Foxglove carry them (`ros2msg`), and the hashes of their types.
+//! Message definitions as carried by recordings and Foxglove (`ros2msg`), and the hashes of their types.
 
 use std::collections::BTreeSet;
 
@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 const SEPARATOR: &str =
     "================================================================================";
 
-/// Each type and its fields, as the packages of ROS 2 Humble have them (and all later distributions until now).
+/// Each type and its fields, as in the packages of ROS 2 Humble (and all later distributions so far).
 const DEFINITIONS: &[(&str, &str)] = &[
     ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n"),
     ("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"),
@@ -100,7 +100,7 @@ const DEFINITIONS: &[(&str, &str)] = &[
     ),
 ];
 
-/// Hashes of the types (REP 2011), by which ROS 2 since Iron sees that both ends mean the same message.
+/// Hashes of the types (REP 2011), by which ROS 2 since Iron checks that both ends use the same message.
 const TYPE_HASHES: &[(&str, &str)] = &[
     (
         "geometry_msgs/PoseWithCovarianceStamped",
@@ -122,12 +122,12 @@ const TYPE_HASHES: &[(&str, &str)] = &[
     ),
 ];
 
-/// The name of a type as ROS 2's tools spell it: `nav_msgs/msg/Odometry` of `nav_msgs/Odometry`.
+/// The name of a type as the tools of ROS 2 spell it: `nav_msgs/msg/Odometry` for `nav_msgs/Odometry`.
 pub fn full_name(name: &str) -> String {
     name.replacen('/', "/msg/", 1)
 }
 
-/// The hash of a type, as `RIHS01_…`; `None` for one that has no topic here.
+/// The hash of a type, as `RIHS01_…`; `None` for a type without a topic here.
 pub fn type_hash(name: &str) -> Option<String> {
     let (_, hash) = TYPE_HASHES.iter().find(|(known, _)| *known == name)?;
     Some(format!("RIHS01_{hash}"))
@@ -137,8 +137,8 @@ fn fields(name: &str) -> Option<&'static str> {
     DEFINITIONS.iter().find(|(known, _)| *known == name).map(|(_, fields)| *fields)
 }
 
-/// The whole definition of a type: its fields, then each type they use, in the form `ros2msg`. `None` for a type
-/// that is not ours.
+/// The complete definition of a type: its fields, then each type they use, in the form `ros2msg`. `None` for
+/// an unknown type.
 pub fn schema(name: &str) -> Option<String> {
     let mut text = fields(name)?.to_owned();
     let mut seen = BTreeSet::from([name]);
@@ -164,7 +164,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_schema_has_every_type_that_it_uses_once() {
+    fn a_schema_contains_every_type_that_it_uses_once() {
         for (name, _) in TYPE_HASHES {
             let text = schema(name).unwrap();
             for line in text.lines().filter(|line| !line.starts_with("MSG: ")) {

@@ -31,46 +31,46 @@ types! {
     GraphRecord "semidense_msgs/Graph",
 }
 
-/// Whether messages are sent again until they arrive.
+/// Whether messages are resent until they arrive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reliability {
-    /// Yes.
+    /// Messages are resent.
     Reliable,
-    /// No: the next one is newer anyway.
+    /// Messages are not resent: the next one is newer anyway.
     BestEffort,
 }
 
-/// What a late subscriber gets.
+/// What a late subscriber receives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Durability {
-    /// What comes from then on.
+    /// Only later messages.
     Volatile,
-    /// The last message too.
+    /// Also the last message.
     TransientLocal,
 }
 
-/// A topic of ROS.
+/// A ROS topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RosTopic {
-    /// Its name; one that begins with `/` is the same for every instance, others are below the instance's name.
+    /// Name; one that begins with `/` is the same for every instance, others are below the instance's name.
     pub name: &'static str,
-    /// Its type, as `nav_msgs/Odometry`.
+    /// Type, such as `nav_msgs/Odometry`.
     pub message_type: &'static str,
-    /// Whether messages are sent again until they arrive.
+    /// Whether messages are resent until they arrive.
     pub reliability: Reliability,
-    /// What a late subscriber gets.
+    /// What a late subscriber receives.
     pub durability: Durability,
-    /// Messages that a slow subscriber may be behind.
+    /// Queue depth for a slow subscriber, messages.
     pub depth: usize,
 }
 
 impl RosTopic {
-    /// Its whole name for an instance.
+    /// The full name for an instance.
     pub fn full_name(&self, instance: &str) -> String {
         self.name_in(&namespace(instance))
     }
 
-    /// Its whole name in a namespace, which begins with `/`.
+    /// The full name in a namespace, which begins with `/`.
     pub fn name_in(&self, namespace: &str) -> String {
         if self.name.starts_with('/') {
             self.name.to_owned()
@@ -80,7 +80,7 @@ impl RosTopic {
     }
 }
 
-/// The namespace of an instance's topics: ROS allows letters, digits and `_`, and no digit first.
+/// The namespace of an instance's topics: ROS allows letters, digits and `_`, but no leading digit.
 pub fn namespace(instance: &str) -> String {
     let allowed = |c: char| if c.is_ascii_alphanumeric() { c } else { '_' };
     let name: String = instance.chars().map(allowed).collect();
@@ -97,16 +97,16 @@ const fn reliable<T: RosMessage>(name: &'static str, depth: usize) -> RosTopic {
     RosTopic { name, message_type: T::TYPE, reliability, durability, depth }
 }
 
-/// The last message stays for late subscribers.
+/// A topic whose last message is kept for late subscribers.
 const fn latched<T: RosMessage>(name: &'static str) -> RosTopic {
     RosTopic { durability: Durability::TransientLocal, ..reliable::<T>(name, 1) }
 }
 
-/// Messages of a camera that a subscriber may be behind: ROS's profile for sensor data.
+/// Queue depth of camera topics: ROS's profile for sensor data.
 const SENSOR_DEPTH: usize = 5;
-/// Transforms that a subscriber may be behind: that of tf2.
+/// Queue depth of transforms: that of tf2.
 const TF_DEPTH: usize = 100;
-/// Poses and others that a subscriber may be behind: ROS's default.
+/// Queue depth of poses and others: ROS's default.
 const DEFAULT_DEPTH: usize = 10;
 
 /// The pose in the map, with covariance: the best estimate, may step when the map is revised.
@@ -126,19 +126,19 @@ pub const COMPRESSED_IMAGE: RosTopic =
     sensor::<CompressedImage>("image_rect/compressed", SENSOR_DEPTH);
 /// Intrinsics of the image.
 pub const CAMERA_INFO: RosTopic = sensor::<CameraInfo>("camera_info", SENSOR_DEPTH);
-/// Poses of all keyframes in the map; a late subscriber gets the last.
+/// Poses of all keyframes in the map; a late subscriber receives the last message.
 pub const KEYFRAMES: RosTopic = latched::<PoseArray>("keyframes");
 /// Health of the three processes.
 pub const DIAGNOSTICS: RosTopic = reliable::<DiagnosticArray>("/diagnostics", DEFAULT_DEPTH);
 
-/// Of each image what `sensor_msgs` has no place for.
+/// The properties of each image that do not fit into `sensor_msgs`.
 pub const FRAME_RECORDS: RosTopic = reliable::<FrameRecord>("details/frame", DEFAULT_DEPTH);
-/// All of each pose.
+/// All fields of each pose.
 pub const POSE_RECORDS: RosTopic = reliable::<PoseRecord>("details/pose", DEFAULT_DEPTH);
-/// What a keyframe has besides its points.
+/// The properties of a keyframe besides its points.
 pub const KEYFRAME_RECORDS: RosTopic =
     reliable::<KeyframeRecord>("details/keyframe", DEFAULT_DEPTH);
-/// What the map's graph has besides poses.
+/// The properties of the map's graph besides poses.
 pub const GRAPH_RECORDS: RosTopic = reliable::<GraphRecord>("details/graph", DEFAULT_DEPTH);
 
 #[cfg(test)]
@@ -146,12 +146,12 @@ mod tests {
     use super::*;
     use crate::ros::schema::{schema, type_hash};
 
-    /// All of ROS's types.
+    /// The topics whose types are ROS's.
     const TOPICS: [RosTopic; 9] =
         [POSE, ODOMETRY, TF, POINTS, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, KEYFRAMES, DIAGNOSTICS];
 
     #[test]
-    fn names_are_ros_names_and_types_are_known() {
+    fn names_follow_the_rules_of_ros_and_types_are_known() {
         assert_eq!(POSE.full_name("semidense"), "/semidense/pose");
         assert_eq!(POSE.full_name("2-left"), "/rig_2_left/pose");
         assert_eq!(TF.full_name("left"), "/tf");

@@ -1,4 +1,4 @@
-//! Images of a ROS 2 topic, written as a stream of frames that capture reads.
+//! Images of a ROS 2 topic, written as a stream of frames for capture.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -25,7 +25,7 @@ use crate::ros2::camera_rig::{CameraRigError, camera_info_topic, is_rectified, r
 use crate::ros2::image_source::{GrayFrame, ImageError};
 use crate::ros2::node::{NodeError, RosNode};
 
-/// Pause between two looks for a socket that is not there, or for a message.
+/// Pause before retrying a missing socket or polling for a message again.
 const RETRY_PERIOD: Duration = Duration::from_millis(100);
 
 /// Why images cannot be read.
@@ -34,36 +34,36 @@ pub enum CameraError {
     /// The network cannot be joined.
     #[error(transparent)]
     Node(#[from] NodeError),
-    /// The system refuses.
+    /// A system call failed.
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// Nobody says what the camera is.
+    /// No publisher describes the camera.
     #[error(
-        "no CameraInfo came on {topic} within {seconds} s; name the camera's calibration with --rig FILE, or its topic with --camera-info"
+        "no CameraInfo arrived on {topic} within {seconds} s; name the camera's calibration with --rig FILE, or its topic with --camera-info"
     )]
     NoInfo {
-        /// Where it was expected.
+        /// The topic on which it was expected.
         topic: String,
-        /// How long.
+        /// How long it was waited for.
         seconds: u64,
     },
-    /// The camera's calibration is of no use.
+    /// The camera's calibration cannot be used.
     #[error("{topic}: {source}")]
     Rig {
-        /// Where it came from.
+        /// The topic it came from.
         topic: String,
         /// What is wrong.
         source: CameraRigError,
     },
-    /// A signal came first.
+    /// A signal arrived first.
     #[error("interrupted")]
     Interrupted,
 }
 
-/// The quality of service that topics are read with: that of sensors, which any publisher's fits.
+/// Quality of service of the subscription: that for sensors, compatible with any publisher.
 const SENSOR: &RosTopic = &topic::IMAGE;
 
-/// Waits for what ROS says about the camera of the images on a topic and gives the text of its rig file.
+/// Waits for the CameraInfo of a topic's images and returns the text of its rig file.
 pub fn await_rig(
     mut node: RosNode,
     images: &str,
@@ -89,9 +89,9 @@ pub fn await_rig(
     }
 }
 
-/// Writes the images of a topic as frames until a signal comes, or standard output is closed; a topic that ends in
-/// `/compressed` is of `CompressedImage`. Where there is a `socket`, that of
-/// `semidense capture stream:PATH`, they go there; it is connected to again when it is gone.
+/// Writes the images of a topic as frames until a signal arrives or standard output is closed; a topic that
+/// ends in `/compressed` has messages of type `CompressedImage`. With a `socket`, that of `semidense capture
+/// stream:PATH`, frames are written there; a lost connection is re-established.
 pub fn run(
     mut node: RosNode,
     topic: String,
@@ -111,7 +111,7 @@ pub fn run(
         let images = node.subscription::<Image>(SENSOR, &topic)?;
         named.spawn(move || forward(&images, &topic, GrayFrame::unpack, sink))?
     };
-    // The thread may wait for an image, or for capture, forever; it ends with the process.
+    // The thread may wait for an image, or for capture, indefinitely; it ends with the process.
     while !reading.is_finished() && !shutdown.is_requested() {
         if is_closed(is_stdout, shutdown.descriptor()) {
             break;
@@ -120,12 +120,12 @@ pub fn run(
     Ok(())
 }
 
-/// Waits a moment for a signal; whether standard output, where it is written to, is closed.
+/// Waits briefly for a signal; returns whether standard output, if written to, is closed.
 fn is_closed(is_stdout: bool, interrupt: BorrowedFd<'_>) -> bool {
     let timeout = rustix::event::Timespec { tv_sec: 0, tv_nsec: 200_000_000 };
     let mut polled = vec![PollFd::from_borrowed_fd(interrupt, PollFlags::IN)];
     if is_stdout {
-        // A closed end is told without being asked for.
+        // A closed end is reported even without requested events.
         polled.push(PollFd::from_borrowed_fd(stdout(), PollFlags::empty()));
     }
     let _ = poll(&mut polled, Some(&timeout));
@@ -133,7 +133,7 @@ fn is_closed(is_stdout: bool, interrupt: BorrowedFd<'_>) -> bool {
     polled.get(1).is_some_and(|output| output.revents().intersects(gone))
 }
 
-/// Takes the newest image, again and again, and writes it.
+/// Repeatedly takes the newest image and writes it.
 fn forward<M: RosMessage + DeserializeOwned + 'static>(
     images: &Subscription<M>,
     topic: &str,
@@ -153,7 +153,7 @@ fn forward<M: RosMessage + DeserializeOwned + 'static>(
             Ok(stamp) => stamp,
             Err(error) => {
                 let refusal = error.to_string();
-                // A camera that sends what is not known sends it thirty times a second.
+                // A camera with an unsupported format would be reported thirty times a second.
                 if refusal != last_refusal {
                     tracing::warn!("{topic}: {refusal}");
                     last_refusal = refusal;
@@ -161,7 +161,7 @@ fn forward<M: RosMessage + DeserializeOwned + 'static>(
                 continue;
             }
         };
-        // The publisher's number: a gap is an image that was lost, or passed over here for a newer one.
+        // The publisher's number: a gap is an image that was lost, or skipped here for a newer one.
         let sequence = u64::try_from(info.sequence_number()).unwrap_or(0);
         let header = frame.header(stamp, sequence, realtime_nanos());
         if sink.write(&header, &frame.pixels).is_err() {
@@ -170,7 +170,7 @@ fn forward<M: RosMessage + DeserializeOwned + 'static>(
     }
 }
 
-/// Where frames are written.
+/// Destination of the frames.
 #[derive(Debug)]
 enum Sink {
     Stdout(File),
@@ -183,7 +183,7 @@ fn write_frame(to: &mut impl Write, header: &StreamHeader, pixels: &[u8]) -> io:
 }
 
 impl Sink {
-    /// Writes a frame. A socket that is not there, or goes, loses the frame: the next one is as good.
+    /// Writes a frame. Without a connection, or if it breaks, the frame is lost: the next one is as good.
     fn write(&mut self, header: &StreamHeader, pixels: &[u8]) -> io::Result<()> {
         match self {
             Self::Stdout(file) => write_frame(file, header, pixels),
@@ -198,7 +198,7 @@ impl Sink {
                     return Ok(());
                 };
                 if let Err(error) = write_frame(open, header, pixels) {
-                    tracing::warn!("{}: {error}; connecting again", path.display());
+                    tracing::warn!("{}: {error}; reconnecting", path.display());
                     *stream = None;
                 }
                 Ok(())

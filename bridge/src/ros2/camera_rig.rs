@@ -1,4 +1,4 @@
-//! A rig file of what ROS says about a camera (`sensor_msgs/CameraInfo`).
+//! A rig file from ROS's description of a camera (`sensor_msgs/CameraInfo`).
 
 use std::path::Path;
 
@@ -7,41 +7,41 @@ use semidense::capture::rig_error::RigError;
 
 use crate::ros::message::CameraInfo;
 
-/// Why there is no rig in it.
+/// Why a CameraInfo gives no rig.
 #[derive(Debug, thiserror::Error)]
 pub enum CameraRigError {
-    /// It is not calibrated.
+    /// The camera is not calibrated.
     #[error("the camera is not calibrated: its CameraInfo has no focal length")]
     Uncalibrated,
-    /// Images that are not those that were calibrated.
+    /// The images differ from those that were calibrated.
     #[error(
-        "its images are binned or a part of the sensor's, which is not supported; name a rig of theirs with --rig"
+        "its images are binned or cover only part of the sensor, which is not supported; name a rig for them with --rig"
     )]
     Part,
-    /// A lens that is not known.
+    /// An unsupported lens model.
     #[error(
-        "its lens model `{0}` is not known: known are plumb_bob, rational_polynomial, equidistant and fisheye"
+        "its lens model `{0}` is not supported; supported are plumb_bob, rational_polynomial, equidistant and fisheye"
     )]
     Model(String),
-    /// Values that no camera has.
+    /// Invalid values.
     #[error(transparent)]
     Rig(#[from] RigError),
 }
 
-/// The topic of the camera of images: beside them, as `image_transport` has it.
+/// The CameraInfo topic for images: next to the image topic, as in `image_transport`.
 pub fn camera_info_topic(images: &str) -> String {
     let images = images.strip_suffix("/compressed").unwrap_or(images);
     let folder = images.rsplit_once('/').map_or("", |(folder, _)| folder);
     format!("{folder}/camera_info")
 }
 
-/// Whether a topic is of rectified images, whose camera is the matrix P without a lens.
+/// Whether a topic carries rectified images, whose camera is the matrix P without a lens.
 pub fn is_rectified(images: &str) -> bool {
     let images = images.strip_suffix("/compressed").unwrap_or(images);
     images.rsplit('/').next().is_some_and(|name| name.contains("rect"))
 }
 
-/// The text of a rig file, checked; `topic` is where it came from.
+/// The text of a rig file, validated; `topic` is the origin of `info`.
 pub fn rig_text(
     info: &CameraInfo,
     topic: &str,
@@ -71,7 +71,7 @@ pub fn rig_text(
     let numbers: Vec<String> =
         coefficients.iter().map(|number| format!("{number:?}").to_lowercase()).collect();
     let text = format!(
-        "# Of the CameraInfo on {topic}.\nmodel = \"{model}\"\nwidth = {}\nheight = {}\nfx = {fx:?}\nfy = {fy:?}\n\
+        "# From the CameraInfo on {topic}.\nmodel = \"{model}\"\nwidth = {}\nheight = {}\nfx = {fx:?}\nfy = {fy:?}\n\
          cx = {cx:?}\ncy = {cy:?}\ncoefficients = [{}]\n",
         info.width,
         info.height,
@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn the_lenses_of_ros_are_ours() {
+    fn every_lens_model_of_ros_is_converted() {
         let plain = rig(&info("plumb_bob", &[0.0; 5]), false).unwrap();
         assert_eq!(*plain.camera.distortion(), Distortion::None);
         assert_eq!(plain.camera.intrinsics().fy, 501.0);
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_calibration_is_said() {
+    fn errors_explain_why_there_is_no_calibration() {
         let words = |info: CameraInfo| rig(&info, false).unwrap_err().to_string();
         let none = CameraInfo { k: [0.0; 9], ..info("plumb_bob", &[]) };
         assert!(words(none).contains("not calibrated"));
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn the_camera_is_beside_its_images() {
+    fn the_camera_info_is_next_to_its_images() {
         assert_eq!(camera_info_topic("/camera/image_raw"), "/camera/camera_info");
         assert_eq!(camera_info_topic("/a/b/image_rect/compressed"), "/a/b/camera_info");
         assert_eq!(camera_info_topic("/image"), "/camera_info");

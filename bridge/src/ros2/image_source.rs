@@ -1,4 +1,4 @@
-//! Images of ROS as frames of a stream that capture reads.
+//! Converts ROS images to frames of a stream for capture.
 
 use semidense::capture::decode_error::DecodeError;
 use semidense::capture::image_file::{decode_gray_into, image_size};
@@ -7,29 +7,29 @@ use semidense::capture::stream::format::{StreamClock, StreamHeader};
 
 use crate::ros::message::{CompressedImage, Image, Time};
 
-/// A stamp further than this from the arrival is of another clock: a recording's, a simulation's.
+/// A stamp further than this from the arrival belongs to another clock: a recording's, a simulation's.
 const PLAUSIBLE_NANOS: u64 = 10_000_000_000;
 
-/// Why an image is not passed on.
+/// Why an image is not forwarded.
 #[derive(Debug, thiserror::Error)]
 pub enum ImageError {
-    /// Its format or bytes.
+    /// Invalid format or bytes.
     #[error(transparent)]
     Raw(#[from] RosImageError),
-    /// Its format or bytes.
+    /// Invalid format or bytes of a compressed image.
     #[error("a compressed image ({format}): {source}")]
     Compressed {
-        /// What its sender calls the format.
+        /// The sender's name of the format.
         format: String,
         /// What is wrong.
         source: DecodeError,
     },
-    /// A size that no image has.
-    #[error("an image of {0}x{1} pixels")]
+    /// An impossible size.
+    #[error("invalid image size {0}x{1}")]
     Size(usize, usize),
 }
 
-/// Memory that is used again from image to image.
+/// A grey frame whose memory is reused from image to image.
 #[derive(Debug, Default)]
 pub struct GrayFrame {
     /// Grey values, row by row.
@@ -38,7 +38,7 @@ pub struct GrayFrame {
     size: (u32, u32),
 }
 
-/// Pixels of the largest image that is taken: that of a rig.
+/// Upper limit for the sides of an image, as for a rig, pixels.
 const MAX_SIDE: usize = 8192;
 
 impl GrayFrame {
@@ -51,10 +51,10 @@ impl GrayFrame {
         Ok(())
     }
 
-    /// Takes the grey values of an image and gives its stamp.
+    /// Converts an image to grey and returns its stamp.
     pub fn unpack(&mut self, image: &Image) -> Result<Time, ImageError> {
         let Image { header, encoding, width, height, step, is_bigendian, data } = image;
-        // Before memory is taken: each pixel has at least a byte.
+        // Before memory is allocated: each pixel has at least one byte.
         if (data.len() as u64) < u64::from(*width) * u64::from(*height) {
             return Err(ImageError::Size(*width as usize, *height as usize));
         }
@@ -71,7 +71,7 @@ impl GrayFrame {
         Ok(header.stamp)
     }
 
-    /// Takes the grey values of a compressed image, a JPEG or PNG, and gives its stamp.
+    /// Decodes a compressed image, JPEG or PNG, to grey and returns its stamp.
     pub fn decode(&mut self, image: &CompressedImage) -> Result<Time, ImageError> {
         let broken = |source| ImageError::Compressed { format: image.format.clone(), source };
         let (width, height) = image_size(&image.data).map_err(broken)?;
@@ -81,20 +81,20 @@ impl GrayFrame {
         Ok(image.header.stamp)
     }
 
-    /// The header of a stream for it. `stamp` is ROS's, `now_nanos` CLOCK_REALTIME.
+    /// The stream header of this frame. `stamp` is ROS's, `now_nanos` is CLOCK_REALTIME.
     pub fn header(&self, stamp: Time, sequence: u64, now_nanos: i64) -> StreamHeader {
         let (clock, nanos) = clock_of(stamp, now_nanos);
         StreamHeader::gray(self.size, clock, nanos, sequence)
     }
 }
 
-/// Which clock a stamp is of. An image without one is stamped as it arrives.
+/// The clock of a stamp, and its time. An image without a stamp gets that of its arrival.
 fn clock_of(stamp: Time, now_nanos: i64) -> (StreamClock, i64) {
     let nanos = stamp.nanos();
     match nanos {
         0 => (StreamClock::Realtime, now_nanos),
         _ if nanos.abs_diff(now_nanos) <= PLAUSIBLE_NANOS => (StreamClock::Realtime, nanos),
-        // Before 1970 there are no stamps.
+        // There are no stamps before 1970.
         _ => (StreamClock::Other, nanos.max(0)),
     }
 }
@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn an_image_becomes_a_frame_of_its_stamp() {
+    fn an_image_becomes_a_frame_with_its_stamp() {
         let mut frame = GrayFrame::default();
         frame.unpack(&image("rgb8", 12, [255, 0, 0].repeat(8))).unwrap();
         assert_eq!(frame.pixels, [76; 8]);
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_images_are_errors_and_take_no_memory() {
+    fn malformed_images_are_errors_and_allocate_no_memory() {
         let mut frame = GrayFrame::default();
         let huge = Image { width: 8192, height: 8192, ..image("mono8", 8192, vec![0; 8]) };
         assert!(frame.unpack(&huge).is_err());

@@ -1,9 +1,9 @@
-//! Which domain a node is in and how far it reaches, by options and by the environment that ROS users know.
+//! Domain and reach of a node, from options and from the environment variables that ROS users know.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::str::FromStr;
 
-/// The highest domain whose ports exist: 7400 + 250 × 232 is the last below 65 536.
+/// The highest domain with valid ports: 7400 + 250 × 232 is the last below 65 536.
 const MAX_DOMAIN: u16 = 232;
 
 /// How far a node reaches.
@@ -13,7 +13,7 @@ pub enum Reach {
     Localhost,
     /// Every network of this machine.
     All,
-    /// The networks that have these addresses of this machine.
+    /// The networks of these addresses of this machine.
     Addresses(Vec<IpAddr>),
 }
 
@@ -27,7 +27,7 @@ impl FromStr for Reach {
             _ => {
                 let addresses = text.split(',').map(|part| part.trim().parse::<IpAddr>());
                 addresses.collect::<Result<_, _>>().map(Self::Addresses).map_err(|_| {
-                    "write localhost, all, or addresses of this machine, as 192.168.1.5,10.0.0.2"
+                    "write localhost, all, or addresses of this machine, such as 192.168.1.5,10.0.0.2"
                         .to_owned()
                 })
             }
@@ -51,36 +51,36 @@ impl Reach {
 pub struct Network {
     /// DDS domain: nodes of other domains do not see it.
     pub domain: u16,
-    /// How far it reaches.
+    /// The reach of the node.
     pub reach: Reach,
 }
 
 /// Why a network cannot be chosen.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NetworkError {
-    /// A domain that does not exist.
+    /// An invalid domain.
     #[error("{origin}: `{value}` is not a domain; it must be a number from 0 to 232")]
     Domain {
         /// Option or variable.
         origin: &'static str,
-        /// What it says.
+        /// Its value.
         value: String,
     },
-    /// A range that is not known.
+    /// An unknown range.
     #[error(
         "ROS_AUTOMATIC_DISCOVERY_RANGE: `{0}` is not a range; it must be LOCALHOST, SUBNET, SYSTEM_DEFAULT or OFF"
     )]
     Range(String),
     /// Discovery is off.
     #[error(
-        "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF, so that nobody would find this node; say how far it reaches with --network"
+        "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF, so no other node could discover this one; set its reach with --network"
     )]
     Off,
 }
 
 impl Network {
-    /// By the options, else by the environment, else domain 0 on this machine. `variable` gives a variable of the
-    /// environment.
+    /// Chooses by the options, else by the environment, else domain 0 on this machine. `variable` looks up a
+    /// variable of the environment.
     pub fn choose(
         domain: Option<u16>,
         reach: Option<Reach>,
@@ -95,7 +95,7 @@ impl Network {
         let domain = parsed.ok_or(NetworkError::Domain { origin, value: text })?;
         let reach = match reach {
             Some(reach) => reach,
-            // The older variable wins where it is set, as in ROS.
+            // If set, the older variable takes precedence, as in ROS.
             None if set("ROS_LOCALHOST_ONLY").is_some_and(|only| only == "1") => Reach::Localhost,
             None => match set("ROS_AUTOMATIC_DISCOVERY_RANGE").as_deref() {
                 None | Some("LOCALHOST") => Reach::Localhost,
@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn options_win_over_the_environment_and_nothing_leaves_the_machine_unasked() {
+    fn options_override_the_environment_and_by_default_nothing_leaves_the_machine() {
         let network = |domain, reach| Ok(Network { domain, reach });
         let none = (None, None);
         assert_eq!(chosen(none.clone(), &[]), network(0, Reach::Localhost));

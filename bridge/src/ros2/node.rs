@@ -1,4 +1,4 @@
-//! A node on the ROS 2 network: its name, its topics with their quality of service, and who reads them.
+//! A node on the ROS 2 network: its name, its topics with their quality of service, and their readers.
 
 use ros2_client::dds::rustdds::{
     self, DomainParticipant, DomainParticipantBuilder, Duration, QosPolicies, QosPolicyBuilder,
@@ -12,16 +12,16 @@ use crate::ros::message::RosMessage;
 use crate::ros::topic::{Durability, Reliability, RosTopic};
 use crate::ros2::network::Network;
 
-/// Messages that are kept for readers of a topic that gives the last to who comes late. Without a bound the middleware
-/// keeps thousands, and hands all of them to who comes.
+/// Messages kept for late readers of a transient-local topic. Without a bound the middleware keeps thousands,
+/// and sends all of them to a late reader.
 const KEPT_FOR_LATE_READERS: i32 = 4;
 
-/// Why there is no node, or one of its topics cannot be made.
+/// Why a node or one of its topics cannot be created.
 #[derive(Debug, thiserror::Error)]
 pub enum NodeError {
     /// A name that ROS does not allow.
     #[error(
-        "`{name}` is not a name of ROS ({reason}); use letters, digits and _, no digit first, / between parts"
+        "`{name}` is not a valid ROS name ({reason}); use letters, digits and _, no leading digit, / between parts"
     )]
     Name {
         /// The name.
@@ -29,27 +29,27 @@ pub enum NodeError {
         /// What is wrong.
         reason: String,
     },
-    /// The middleware refuses.
-    #[error("the ROS 2 network cannot be joined: {0}")]
+    /// The middleware reports an error on joining.
+    #[error("cannot join the ROS 2 network: {0}")]
     Network(#[from] rustdds::dds::CreateError),
     /// The middleware refuses a topic or a node.
-    #[error("the ROS 2 network cannot be joined: {0}")]
+    #[error("cannot join the ROS 2 network: {0}")]
     Create(#[from] CreateError),
     /// The middleware refuses the node.
-    #[error("the ROS 2 node cannot be made: {0:?}")]
+    #[error("cannot create the ROS 2 node: {0:?}")]
     Node(NodeCreateError),
 }
 
 /// A reader of one of our topics, somewhere on the network.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RemoteReader {
-    /// The topic, as DDS has it: `rt/tf`.
+    /// The topic as named in DDS: `rt/tf`.
     pub topic: String,
-    /// Whether it takes messages only from a reliable publisher.
+    /// Whether it accepts only a reliable publisher.
     pub wants_reliable: bool,
 }
 
-/// A node.
+/// A ROS 2 node.
 pub struct RosNode {
     namespace: String,
     participant: DomainParticipant,
@@ -58,7 +58,7 @@ pub struct RosNode {
 }
 
 impl RosNode {
-    /// The node `name` in `namespace`, which begins with `/`.
+    /// Creates the node `name` in `namespace`, which begins with `/`.
     pub fn new(network: &Network, namespace: &str, name: &str) -> Result<Self, NodeError> {
         let node_name = NodeName::new(namespace, name).map_err(|error| NodeError::Name {
             name: format!("{}/{name}", namespace.trim_end_matches('/')),
@@ -70,13 +70,13 @@ impl RosNode {
         }
         let participant = builder.build()?;
         let context = Context::from_domain_participant(participant.clone())?;
-        // Parameters and logs of ours are on the command line and in the journal.
+        // Parameters are set on the command line, and logs go to the journal.
         let options = NodeOptions::new().enable_rosout(false).start_parameter_services(false);
         let node = context.new_node(node_name, options).map_err(NodeError::Node)?;
         Ok(Self { namespace: namespace.to_owned(), participant, node, _context: context })
     }
 
-    /// Publishes messages of the type `M` to a topic of the node's namespace.
+    /// Creates a publisher of messages of type `M` for a topic in the node's namespace.
     pub fn publisher<M: RosMessage>(
         &mut self,
         topic: &RosTopic,
@@ -85,7 +85,7 @@ impl RosNode {
         Ok(self.node.create_publisher(&made, None)?)
     }
 
-    /// Takes messages of the type `M` from the topic `name` with the quality of service of `topic`.
+    /// Subscribes to messages of type `M` on the topic `name` with the quality of service of `topic`.
     pub fn subscription<M: RosMessage + 'static>(
         &mut self,
         topic: &RosTopic,
@@ -106,7 +106,7 @@ impl RosNode {
         Ok(self.participant.create_topic(dds_name, dds_type, &qos, TopicKind::NoKey)?)
     }
 
-    /// Everybody who reads a topic of the domain, ours or not.
+    /// All readers of topics in the domain, ours or not.
     pub fn remote_readers(&self) -> Vec<RemoteReader> {
         let readers = self.participant.discovered_readers();
         let remote = |reader: &rustdds::discovery::DiscoveredReaderData| {
@@ -120,7 +120,7 @@ impl RosNode {
     }
 }
 
-/// The name of a ROS topic in DDS: `rt/a/b` of `/a/b`.
+/// The DDS name of a ROS topic: `rt/a/b` for `/a/b`.
 pub fn dds_name(name: &str) -> Result<String, NodeError> {
     ros2_client::Name::parse(name)
         .ok()
@@ -128,7 +128,7 @@ pub fn dds_name(name: &str) -> Result<String, NodeError> {
         .map(|_| format!("rt{name}"))
         .ok_or_else(|| NodeError::Name {
             name: name.to_owned(),
-            reason: "a whole topic's begins with /".to_owned(),
+            reason: "a full topic name begins with /".to_owned(),
         })
 }
 
@@ -137,7 +137,7 @@ fn qos(topic: &RosTopic) -> QosPolicies {
     let depth = i32::try_from(topic.depth).unwrap_or(i32::MAX);
     let builder = QosPolicyBuilder::new().history(policy::History::KeepLast { depth });
     let builder = match topic.reliability {
-        // No write ever waits: what a reader has not confirmed in time is dropped and counted.
+        // A write never waits: what a reader has not confirmed in time is dropped and counted.
         Reliability::Reliable => builder.reliable(Duration::ZERO),
         Reliability::BestEffort => builder.best_effort(),
     };
@@ -160,7 +160,7 @@ mod tests {
     use crate::ros::topic::{KEYFRAMES, POINTS, TF};
 
     #[test]
-    fn names_are_whole_and_quality_is_the_tables() {
+    fn names_are_absolute_and_quality_of_service_follows_the_table() {
         assert_eq!(dds_name("/tf").unwrap(), "rt/tf");
         assert_eq!(dds_name("/a/b_c").unwrap(), "rt/a/b_c");
         for bad in ["tf", "/", "/a//b", "/1a", "/a b", "/a/", ""] {

@@ -1,4 +1,4 @@
-//! Messages that wait for the network: few, the newest of each kind, so that a slow `publish` holds nobody up.
+//! Messages queued for the network: few, the newest of each kind, so that a slow `publish` delays nothing else.
 
 use crate::ros::converter::PoseMessages;
 use crate::ros::message::{CameraInfo, DiagnosticArray, Image, PointCloud2, PoseArray};
@@ -19,7 +19,7 @@ pub enum Outgoing {
     Keyframes(Box<PoseArray>),
 }
 
-/// Places of the kinds of messages in the outbox, the most urgent first.
+/// Slots of the kinds of messages in the outbox, the most urgent first.
 pub mod slot {
     /// Poses.
     pub const POSE: usize = 0;
@@ -33,8 +33,8 @@ pub mod slot {
     pub const KEYFRAMES: usize = 4;
 }
 
-/// Between the thread that reads and the one that publishes. Those wait: poses of a quarter of a second at 30 Hz, ten times
-/// the longest `publish` that was seen; several reports of each process; else the newest.
+/// The queue between the reading and the publishing thread. It holds the poses of a quarter of a second at 30
+/// Hz, ten times the longest `publish` observed; several reports of each process; else the newest message.
 pub fn outbox() -> Slots<Outgoing> {
     Slots::new(&[8, 16, 1, 1, 1])
 }
@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_wins_poses_come_first_and_drops_are_counted() {
+    fn the_newest_message_wins_poses_have_priority_and_drops_are_counted() {
         let outbox = outbox();
         outbox.put(slot::KEYFRAMES, keyframes(1));
         outbox.put(slot::KEYFRAMES, keyframes(2));

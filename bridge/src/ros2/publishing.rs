@@ -1,4 +1,4 @@
-//! What a session reads, published: one thread reads and converts, another hands messages to the network.
+//! Publishes the events of a session: one thread reads and converts, another hands messages to the network.
 
 use std::collections::HashSet;
 use std::os::fd::BorrowedFd;
@@ -26,35 +26,35 @@ use crate::ros2::outbox::{Outgoing, outbox, slot};
 use crate::session::{Event, Graph, Session, SessionError};
 use crate::slots::Slots;
 
-/// Time between two looks who reads.
+/// Interval at which readers are counted.
 const READERS_PERIOD: Duration = Duration::from_millis(500);
-/// Time between two reports of our own, and between two keyframe graphs: what changes the map does so about as often.
+/// Period of this node's own reports, and minimum time between two keyframe graphs: the map changes about as often.
 const REPORT_PERIOD: Duration = Duration::from_secs(1);
-/// Longest wait for something to publish: how soon a signal is seen.
+/// Upper limit for a wait for messages, hence the delay until a signal is noticed.
 const WAIT: Duration = Duration::from_millis(100);
 
-/// What is published and how.
+/// What is published, and how.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PublishParams {
-    /// The instance that is read.
+    /// The instance to read.
     pub instance: String,
     /// Namespace of the topics, beginning with `/`.
     pub namespace: String,
     /// Names of the frames.
     pub frames: FrameIds,
-    /// Name of the camera's frame with x forward, for `/tf_static`; `None` for no such frame.
+    /// Frame id of the camera body with x forward, for `/tf_static`; `None` to omit it.
     pub camera_link: Option<String>,
     /// Whether transforms are published.
     pub tf: bool,
-    /// Least time between two images; `None` for no images.
+    /// Minimum time between two images; `None` for no images.
     pub image_period: Option<Duration>,
-    /// Least time between two clouds; `None` for no clouds.
+    /// Minimum time between two clouds; `None` for no clouds.
     pub points_period: Option<Duration>,
     /// Whether images and clouds are reliable too.
     pub reliable_sensors: bool,
 }
 
-/// Who reads what is costly to make, as of the last look.
+/// Number of readers, at the last check, of messages that are costly to make.
 #[derive(Debug, Default)]
 struct Demand {
     images: AtomicU64,
@@ -67,7 +67,7 @@ pub struct Publishers {
     pose: Publisher<PoseWithCovarianceStamped>,
     odometry: Publisher<Odometry>,
     tf: Option<Publisher<TfMessage>>,
-    /// Kept: its message is for who comes later.
+    /// Kept alive: its message is for late subscribers.
     _tf_static: Option<Publisher<TfMessage>>,
     images: Option<(Publisher<Image>, Publisher<CameraInfo>)>,
     points: Option<Publisher<PointCloud2>>,
@@ -75,16 +75,16 @@ pub struct Publishers {
     diagnostics: Publisher<DiagnosticArray>,
     outbox: Arc<Slots<Outgoing>>,
     demand: Arc<Demand>,
-    /// Readers that cannot be served, by topic: each is named once.
+    /// Topics whose readers cannot be served: each is reported once.
     named: HashSet<String>,
     published: u64,
     refused: u64,
     longest: Duration,
-    /// Last: the publishers say goodbye through it.
+    /// Dropped last: the publishers sign off through it.
     node: RosNode,
 }
 
-/// Images and clouds of this node, with the reliability that was asked for.
+/// An image or cloud topic of this node, with the requested reliability.
 fn sensor(params: &PublishParams, topic: RosTopic) -> RosTopic {
     let reliability =
         if params.reliable_sensors { Reliability::Reliable } else { topic.reliability };
@@ -100,12 +100,12 @@ fn camera_link_transform(params: &PublishParams, camera_link: &str) -> TfMessage
 }
 
 impl Publishers {
-    /// All topics of a node.
+    /// Opens all topics of a node.
     pub fn open(mut node: RosNode, params: PublishParams) -> Result<Self, NodeError> {
         let tf_static = match &params.camera_link {
             Some(link) if params.tf => {
                 let publisher = node.publisher(&topic::TF_STATIC)?;
-                // The only message: there is room for it.
+                // The only message on this topic, so there is room for it.
                 let _ = publisher.publish(camera_link_transform(&params, link));
                 Some(publisher)
             }
@@ -140,7 +140,7 @@ impl Publishers {
         })
     }
 
-    /// What goes on the reading thread.
+    /// The part that runs on the reading thread.
     pub fn reader(&self) -> Reader {
         Reader {
             converter: Converter::new(&self.params.instance, self.params.frames.clone()),
@@ -200,7 +200,7 @@ impl Publishers {
         self.longest = self.longest.max(begin.elapsed());
     }
 
-    /// Counts the readers of what is costly to make, and names those that get nothing.
+    /// Counts the readers of costly messages, and reports those that receive nothing.
     fn look_for_readers(&mut self) {
         let name_of = |topic: RosTopic| dds_name(&topic.name_in(&self.params.namespace));
         let (Ok(image), Ok(info), Ok(points)) =
@@ -215,7 +215,7 @@ impl Publishers {
             if (is_image || is_points) && reader.wants_reliable && !self.params.reliable_sensors {
                 if self.named.insert(reader.topic.clone()) {
                     tracing::warn!(
-                        "a subscriber of {} wants it reliable and gets nothing: set it to best effort, or start this with --reliable-sensors",
+                        "a subscriber of {} requests reliable delivery and receives nothing: set it to best effort, or start this program with --reliable-sensors",
                         reader.topic.trim_start_matches("rt")
                     );
                 }
@@ -228,12 +228,13 @@ impl Publishers {
         self.demand.points.store(clouds, Ordering::Relaxed);
     }
 
-    /// How this node does, as a diagnostic of its own.
+    /// The state of this node as a diagnostic message.
     fn report(&mut self) -> DiagnosticArray {
         let longest_ms = std::mem::take(&mut self.longest).as_secs_f64() * 1e3;
         let dropped = |slot| self.outbox.dropped(slot);
         let lost = dropped(slot::POSE) + self.refused;
-        let message = if lost == 0 { "publishing" } else { "publishing; some were dropped" };
+        let message =
+            if lost == 0 { "publishing" } else { "publishing; some messages were dropped" };
         let values = vec![
             figure("published", self.published),
             figure("dropped_poses", dropped(slot::POSE)),
@@ -247,24 +248,24 @@ impl Publishers {
     }
 }
 
-/// Whether a message was taken: a topic whose reliable readers confirm nothing takes no more after a while.
+/// Whether a message was accepted: a topic whose reliable readers confirm nothing refuses messages after a while.
 fn send<M: RosMessage>(publisher: &Publisher<M>, message: M) -> bool {
     publisher.publish(message).inspect_err(|_| tracing::debug!("{} was refused", M::TYPE)).is_ok()
 }
 
-/// Reads a session and makes messages of what it gives.
+/// Reads a session and converts its events to messages.
 pub struct Reader {
     converter: Converter,
     params: PublishParams,
     outbox: Arc<Slots<Outgoing>>,
     demand: Arc<Demand>,
-    /// The active keyframe, for who comes later.
+    /// The active keyframe, for late subscribers.
     keyframe: Option<Arc<Keyframe>>,
     keyframe_is_new: bool,
     points_readers: u64,
     image_sent: LastTime,
     points_sent: LastTime,
-    /// The newest graph, until it is sent.
+    /// The newest graph until it is sent.
     graph: Option<Arc<Graph>>,
     graph_sent: LastTime,
 }
@@ -276,7 +277,7 @@ impl Drop for Reader {
 }
 
 impl Reader {
-    /// Reads what has come; see [`Session::read`].
+    /// Reads pending events; see [`Session::read`].
     pub fn read(
         &mut self,
         session: &mut Session,
@@ -296,7 +297,7 @@ impl Reader {
                 self.keyframe = None;
             }
             Event::Left => tracing::warn!(
-                "instance {} is gone; waiting for the next one of that name",
+                "instance {} has ended; waiting for the next one of that name",
                 self.params.instance
             ),
             Event::Pose(pose) => {
@@ -318,7 +319,7 @@ impl Reader {
             }
             Event::Graph(graph) => self.graph = Some(Arc::clone(graph)),
             Event::Health(owner, health) => {
-                // Stamped with when the process wrote it.
+                // Stamped with the time at which the process wrote it.
                 let age = now_nanos().saturating_sub(health.published_nanos);
                 let stamp = Time::from_nanos(realtime_nanos().saturating_sub(age));
                 let report = self.converter.diagnostics(owner, health, stamp);
@@ -328,7 +329,7 @@ impl Reader {
         }
     }
 
-    /// The newest revision of the keyframe, at most once in a period, and again when somebody has come.
+    /// Sends the newest revision of the keyframe, at most once per period, and again for a new subscriber.
     fn put_points_if_due(&mut self) {
         let readers = self.demand.points.load(Ordering::Relaxed);
         let has_new_reader = readers > self.points_readers;
@@ -344,7 +345,7 @@ impl Reader {
         }
     }
 
-    /// The newest graph, at most once a second.
+    /// Sends the newest graph, at most once a second.
     fn put_graph_if_due(&mut self) {
         if let Some(graph) = self.graph.take_if(|_| self.graph_sent.is_due(REPORT_PERIOD)) {
             let keyframes = self.converter.keyframes(&graph, Time::from_nanos(realtime_nanos()));

@@ -1,4 +1,4 @@
-//! A run that is over, read from its folder: `keyframes.txt`, `trajectory.txt`, `map.ply`, `summary.json`.
+//! Loads a finished run from its folder: `keyframes.txt`, `trajectory.txt`, `map.ply`, `summary.json`.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -19,37 +19,37 @@ use semidense::slam::trajectory::{EpochPose, StampedPose, gaps_in};
 use semidense::slam::up::up_direction;
 use serde_json::Value;
 
-/// Most lines of a PLY's header.
+/// Upper limit for the header lines of a PLY.
 const MAX_HEADER_LINES: usize = 256;
-/// Most bytes of one point of a PLY: ours has 40.
+/// Upper limit for the bytes of one point of a PLY: ours has 40.
 const MAX_POINT_BYTES: usize = 1024;
-/// Points that are asked for their normals, to find what is up.
+/// Points whose normals are used to find the up direction.
 const MOST_NORMALS: usize = 20_000;
-/// Points that are read at a time.
+/// Points read at a time.
 const CHUNK: usize = 4096;
-/// The camera where the folder does not say: 640 by 480, 62° wide.
+/// The camera if the folder does not specify one: 640 by 480, 62° wide.
 const USUAL_CAMERA: Intrinsics = Intrinsics::pinhole(640, 480, 530.0);
 
 /// Why a run cannot be shown.
 #[derive(Debug, thiserror::Error)]
 pub enum FinishedError {
-    /// A file that is not there, or cannot be read.
+    /// A file that does not exist or cannot be read.
     #[error("{path}: {source}; name the folder that a run has written, for example output/latest")]
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
-    /// A file that says something else than it should.
+    /// A file with unexpected content.
     #[error("{path}: {what}")]
     Content {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// What is wrong with it.
         what: String,
     },
-    /// The trajectory.
+    /// The trajectory could not be read.
     #[error(transparent)]
     Trajectory(#[from] TrajectoryFileError),
 }
@@ -58,12 +58,12 @@ pub enum FinishedError {
 pub fn read_run(folder: &Path, max_points: usize) -> Result<Vec<u8>, FinishedError> {
     let keyframes = read_keyframes(&folder.join("keyframes.txt"))?;
     let path = read_trajectory_file(&folder.join("trajectory.txt"))?.poses;
-    // Frames that were placed afterwards are not in it.
+    // Does not contain frames that were placed afterwards.
     let online = read_trajectory(&folder.join("trajectory_online.txt")).unwrap_or_default();
     let Shown { keyframes, path, gaps } = of_longest_epoch(keyframes, &path, &online);
     let points = read_points(&folder.join("map.ply"), max_points)?;
     let intrinsics = camera(&read_summary(folder)).unwrap_or(USUAL_CAMERA);
-    // A cloud without normals leaves it to the cameras.
+    // Without normals, the up direction follows from the cameras alone.
     let surface = read_surface(&folder.join("map.ply"), MOST_NORMALS).unwrap_or_default();
     let up = up_direction(path.iter(), surface.iter().map(|point| point.normal));
     Ok(pack(&SceneInput {
@@ -77,19 +77,19 @@ pub fn read_run(folder: &Path, max_points: usize) -> Result<Vec<u8>, FinishedErr
     }))
 }
 
-/// The summary of a run; nothing where there is none.
+/// The summary of a run; null if it has none.
 pub fn read_summary(folder: &Path) -> Value {
     let bytes = fs::read(folder.join("summary.json")).unwrap_or_default();
     serde_json::from_slice(&bytes).unwrap_or_default()
 }
 
-/// The camera as the summary has it.
+/// The camera in the summary.
 fn camera(summary: &Value) -> Option<Intrinsics> {
     let camera: Intrinsics = serde_json::from_value(summary.get("camera")?.clone()).ok()?;
     camera.is_valid().then_some(camera)
 }
 
-/// The keyframes with their epochs, in the order of their stamps.
+/// The keyframes with their epochs, sorted by stamp.
 fn read_keyframes(path: &Path) -> Result<Vec<(u32, SceneKeyframe)>, FinishedError> {
     let text = fs::read_to_string(path)
         .map_err(|source| FinishedError::Read { path: path.to_owned(), source })?;
@@ -105,19 +105,19 @@ fn read_keyframes(path: &Path) -> Result<Vec<(u32, SceneKeyframe)>, FinishedErro
     Ok(keyframes)
 }
 
-/// What is shown of a run.
+/// The part of a run that is shown.
 #[derive(Debug)]
 struct Shown {
     keyframes: Vec<SceneKeyframe>,
     path: Vec<StampedPose>,
-    /// Places in it before which another epoch stands.
+    /// Indices into the path before which a stretch of another epoch is left out.
     gaps: Vec<usize>,
 }
 
-/// The epoch with the most tracked frames, of which map.ply is: each epoch has a place and a unit of its own. Frames that are
-/// not `online` got their pose afterwards and do not count. Where `path` marks no epochs and there are keyframes of several,
-/// a pose is taken to be of the epoch of the newest keyframe at its stamp, and those that are not `online`, whose stamps do
-/// not tell, are left out.
+/// Selects the epoch with the most tracked frames, which is that of map.ply: each epoch has its own origin
+/// and unit. Frames that are not `online` got their pose afterwards and do not count. If `path` marks no
+/// epochs and there are keyframes of several, a pose is assigned to the epoch of the newest keyframe at its
+/// stamp, and poses that are not `online`, whose stamps are inconclusive, are left out.
 fn of_longest_epoch(
     keyframes: Vec<(u32, SceneKeyframe)>,
     path: &[EpochPose],
@@ -142,13 +142,13 @@ fn of_longest_epoch(
     let is_shown =
         |of: &&EpochPose| is_all || epoch_of(of) == longest && (is_marked || is_online(of));
     let shown = path.iter().filter(is_shown).map(|of| of.pose).collect();
-    // Poses that are left out without a mark are of this epoch, as far as anyone knows.
+    // Without marks, the poses left out may belong to this epoch too.
     let gaps = longest.filter(|_| is_marked).map_or_else(Vec::new, |epoch| gaps_in(path, epoch));
     let of_epoch = keyframes.iter().filter(|(epoch, _)| is_all || Some(*epoch) == longest);
     Shown { keyframes: of_epoch.map(|(_, keyframe)| *keyframe).collect(), path: shown, gaps }
 }
 
-/// A line: stamp, translation, quaternion, unit, id, sequence, epoch …
+/// Parses a line: stamp, translation, quaternion, unit, id, sequence, epoch …
 fn keyframe(line: &str) -> Option<(u32, SceneKeyframe)> {
     let words: Vec<&str> = line.split_whitespace().collect();
     let numbers: Option<Vec<f64>> = words.get(1..9)?.iter().map(|word| word.parse().ok()).collect();
@@ -164,10 +164,10 @@ fn keyframe(line: &str) -> Option<(u32, SceneKeyframe)> {
     is_usable.then_some((words.get(11)?.parse().ok()?, keyframe))
 }
 
-/// The bytes of a number, and how it is read.
+/// Size of a number in bytes, and its decoder.
 type Kind = (usize, fn(&[u8]) -> f64);
 
-/// The kind of this name in a PLY.
+/// The number type of this name in a PLY.
 fn kind_of(name: &str) -> Option<Kind> {
     let kind: Kind = match name {
         "char" | "int8" => (1, |bytes| f64::from(bytes[0] as i8)),
@@ -183,7 +183,7 @@ fn kind_of(name: &str) -> Option<Kind> {
     Some(kind)
 }
 
-/// Where a property stands in a point, and how it is written.
+/// Offset and encoding of a property within a point.
 #[derive(Debug, Clone, Copy)]
 struct Property {
     offset: usize,
@@ -197,7 +197,7 @@ impl Property {
     }
 }
 
-/// The header of a binary, little-endian PLY whose first element is its points.
+/// Header of a binary, little-endian PLY whose first element is its vertices.
 #[derive(Debug, Default)]
 struct Layout {
     count: usize,
@@ -257,8 +257,8 @@ impl Layout {
     }
 }
 
-/// The points; where they are more than `most` the first of them, which show all of the map, or an even part of those
-/// that stand by keyframe.
+/// Reads the points; of more than `most`, the first ones, which cover the whole map, or every n-th if they
+/// are ordered by keyframe.
 fn read_points(path: &Path, most: usize) -> Result<Vec<ScenePoint>, FinishedError> {
     let content = |what: String| FinishedError::Content { path: path.to_owned(), what };
     let failed = |source| FinishedError::Read { path: path.to_owned(), source };
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_with_a_ply_is_said() {
+    fn errors_name_what_is_wrong_with_a_ply() {
         let cases = [
             (HEADER.replace("binary_little_endian", "ascii"), "not binary"),
             (HEADER.replace("float y", "float b"), "no y"),
@@ -342,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn of_several_epochs_that_with_the_most_poses_is_shown_alone() {
+    fn only_the_epoch_with_the_most_poses_is_shown() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let line = |secs: f64, id: u64, epoch: u32| {
             format!("{secs} 1 2 3 0 0 0 1 0.5 {id} 9 {epoch} 100 Established\n")
@@ -360,13 +360,13 @@ mod tests {
         let unmarked = |poses: &[StampedPose]| -> Vec<EpochPose> {
             poses.iter().map(|pose| EpochPose { epoch: 0, pose: *pose }).collect()
         };
-        // The pose at 2.0 was placed afterwards: it is one from before the second epoch began.
+        // The pose at 2.0 was placed afterwards: it dates from before the second epoch began.
         let (path, online) = (at(&[1.0, 1.5, 2.0, 2.5, 3.0, 6.0]), at(&[1.0, 1.5, 2.5, 3.0, 6.0]));
         let all = unmarked(&path);
         let shown = of_longest_epoch(read_keyframes(file.path()).unwrap(), &all, &online);
         assert_eq!(shown.keyframes.iter().map(|k| k.keyframe_id).collect::<Vec<_>>(), [1, 4]);
         assert_eq!((shown.path, shown.gaps), (at(&[1.0, 1.5, 6.0]), vec![]));
-        // Of one epoch everything is shown.
+        // With a single epoch everything is shown.
         fs::write(file.path(), [line(1.0, 1, 0), line(2.0, 2, 0)].concat()).unwrap();
         let shown = of_longest_epoch(read_keyframes(file.path()).unwrap(), &all, &online);
         assert_eq!((shown.keyframes.len(), shown.path), (2, path));
@@ -378,10 +378,10 @@ mod tests {
     }
 
     #[test]
-    fn the_path_is_of_one_marked_epoch_with_a_gap_where_another_stands_in_it() {
+    fn the_path_has_a_gap_where_another_marked_epoch_interrupts_it() {
         let folder = tempfile::tempdir().unwrap();
         let write = |name: &str, text: &str| fs::write(folder.path().join(name), text).unwrap();
-        // The camera is found in the first epoch again while the newest keyframe is of the second.
+        // The camera is relocalised in the first epoch while the newest keyframe belongs to the second.
         let keyframe = |secs: f64, id: u64, epoch: u32| {
             format!("{secs} 0 0 0 0 0 0 1 1 {id} 9 {epoch} 100 Established\n")
         };

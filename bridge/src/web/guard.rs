@@ -1,4 +1,4 @@
-//! Who may ask: pages of other sites must not, and beyond this machine only who knows the token.
+//! Access control: refuses pages of other sites and, beyond this machine, clients without the token.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -12,27 +12,29 @@ const TOKEN_BYTES: usize = 16;
 /// Why a request is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Refusal {
-    /// It is addressed to a name that is not ours: a page of another site may be behind it.
+    /// The host name is not one of this server's: a page of another site may be behind it.
     #[error(
         "this server does not answer to that name: use its IP address, localhost, or start it with --host NAME"
     )]
     Host,
-    /// A page of another site asks.
-    #[error("a page of another site may not ask: start the server with --allow-origin to let it")]
+    /// The request comes from a page of another site.
+    #[error(
+        "requests from pages of other sites are refused: start the server with --allow-origin to allow one"
+    )]
     Origin,
-    /// The token is missing or another one.
-    #[error("open the address that `semidense view` has printed: it ends in ?token=…")]
+    /// The token is missing or wrong.
+    #[error("open the address that `semidense view` printed: it ends in ?token=…")]
     Token,
 }
 
-/// What is asked of every request.
+/// Requirements on every request.
 #[derive(Debug, Clone, Default)]
 pub struct Guard {
-    /// Names besides IP addresses and localhost that this server is known by.
+    /// Accepted host names besides IP addresses and localhost.
     pub hosts: Vec<String>,
-    /// Other sites whose pages may ask.
+    /// Other sites whose pages are admitted.
     pub origins: Vec<String>,
-    /// What must be known.
+    /// The required token.
     pub token: Option<String>,
 }
 
@@ -47,7 +49,7 @@ impl Guard {
         let is_allowed = |origin: &str| self.origins.iter().any(|of| of == origin);
         match head.header("origin") {
             Some(origin) if !is_own(origin) && !is_allowed(origin) => return Err(Refusal::Origin),
-            // One that comes twice is not believed.
+            // A repeated header is not trusted.
             None if head.has("origin") => return Err(Refusal::Origin),
             _ => {}
         }
@@ -58,8 +60,8 @@ impl Guard {
         if is_known { Ok(()) } else { Err(Refusal::Token) }
     }
 
-    /// A name that resolves here only because somebody's name server says so would let that somebody's pages in. An IP
-    /// address cannot be such a name.
+    /// Whether `host` is one of this server's names. A name that resolves here only by a foreign name server
+    /// would admit the pages of that server's owner; an IP address cannot be such a name.
     fn answers_to(&self, host: &str) -> bool {
         if host.parse::<SocketAddr>().is_ok() || host.parse::<IpAddr>().is_ok() {
             return true;
@@ -75,10 +77,10 @@ impl Guard {
     }
 }
 
-/// Name of the cookie that keeps the token.
+/// Name of the cookie that holds the token.
 pub const COOKIE: &str = "semidense_token";
 
-/// Compares in a time that does not tell how much is right.
+/// Compares in a time that does not reveal how much is correct.
 fn is_same(given: &str, token: &str) -> bool {
     let (given, token) = (given.as_bytes(), token.as_bytes());
     given.len() == token.len() && given.iter().zip(token).fold(0, |sum, (a, b)| sum | (a ^ b)) == 0
@@ -102,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn names_that_others_may_have_given_are_refused() {
+    fn host_names_that_others_may_have_assigned_are_refused() {
         let guard = Guard { hosts: vec!["robot.local".to_owned()], ..Guard::default() };
         for good in [
             "127.0.0.1:8765",
@@ -143,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn who_does_not_know_the_token_is_refused() {
+    fn requests_without_the_token_are_refused() {
         let token = new_token().unwrap();
         assert_eq!(token.len(), 2 * TOKEN_BYTES);
         assert_ne!(token, new_token().unwrap());

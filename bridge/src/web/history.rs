@@ -1,5 +1,5 @@
-//! Keyframes that pages have not seen, about ten a second, or have in an older revision, one a second: the mapper is asked
-//! for them while a page is open.
+//! Keyframes that pages lack, about ten a second, or have in an outdated revision, one a second: requested
+//! from the mapper while a page is open.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,16 +17,16 @@ use crate::web::scene::Scene;
 
 /// Pause between two keyframes: each costs the mapper a copy of up to 2 MB, about a millisecond.
 const REQUEST_PAUSE: Duration = Duration::from_millis(60);
-/// Pause behind a new revision: a correction of the map is one of all its keyframes.
+/// Pause after a new revision: a correction of the map revises all of its keyframes.
 const REVISION_PAUSE: Duration = Duration::from_secs(1);
-/// Pause where nothing is missing or nobody looks.
+/// Pause while nothing is missing or no page is open.
 const IDLE_PAUSE: Duration = Duration::from_millis(300);
-/// Pause after a failure: another reader has the place, or the run has just ended.
+/// Pause after a failure: another reader holds the ports, or the run has just ended.
 const FAILURE_PAUSE: Duration = Duration::from_secs(2);
-/// Longest wait for the mapper, which answers between two frames.
+/// Upper limit for the mapper's answer, which it sends between two frames.
 const LONGEST_ANSWER: Duration = Duration::from_secs(2);
 
-/// Asks until `is_over`.
+/// Requests missing keyframes until `is_over`.
 pub fn follow(place: &Place, scene: &Arc<Scene>, is_over: &AtomicBool) {
     let mut asking: Option<(u64, Asking)> = None;
     while !is_over.load(Ordering::Relaxed) {
@@ -40,7 +40,7 @@ pub fn follow(place: &Place, scene: &Arc<Scene>, is_over: &AtomicBool) {
             asking = None;
         }
         let Some(keyframe_id) = wanted.filter(|_| is_joined && scene.pages() > 0) else {
-            // The place is for one reader: it is given back while nothing is wanted.
+            // The ports admit one reader: release them while nothing is wanted.
             asking = None;
             std::thread::sleep(IDLE_PAUSE);
             continue;
@@ -55,7 +55,7 @@ pub fn follow(place: &Place, scene: &Arc<Scene>, is_over: &AtomicBool) {
                     tracing::debug!("{error}");
                     note(
                         scene,
-                        "keyframes from before this page was started are missing: another reader asks for them",
+                        "keyframes from before this page was started are missing: another reader is requesting them",
                     );
                     std::thread::sleep(FAILURE_PAUSE);
                     continue;
@@ -88,7 +88,7 @@ fn note(scene: &Scene, text: &str) {
     }
 }
 
-/// The ports for asking; the hub is dropped last.
+/// The ports of a request; the hub is dropped last.
 struct Asking {
     depths: Subscriber<DepthPoint, KeyframeHeader>,
     images: Subscriber<u8, KeyframeImageHeader>,
@@ -107,7 +107,7 @@ impl Asking {
         })
     }
 
-    /// The keyframe, `None` where it does not come although the mapper has sent it.
+    /// Requests a keyframe; `None` if it does not arrive although the mapper has sent it.
     fn ask(&self, keyframe_id: u64) -> Result<Option<Keyframe>, CommandError> {
         let begin = Instant::now();
         let failed =

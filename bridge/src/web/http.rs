@@ -1,4 +1,4 @@
-//! As much of HTTP as the page needs: one request a connection, its head bounded in bytes and time.
+//! The part of HTTP that the page needs: one request per connection, its head bounded in bytes and time.
 
 use std::borrow::Cow;
 use std::fmt::Display;
@@ -8,16 +8,16 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-/// Most bytes of a request's head: what browsers and scrapers send is a tenth of it.
+/// Upper limit for the bytes of a request's head: browsers and scrapers send a tenth of it.
 pub const MAX_HEAD_BYTES: usize = 8 << 10;
-/// Most header lines: as above.
+/// Upper limit for the header lines, with the same margin.
 const MAX_HEADERS: usize = 64;
-/// Longest time in which a head must have come: a phone on bad wireless takes a second.
+/// Upper limit for the arrival of a head: a phone on a bad wireless link takes a second.
 const LONGEST_HEAD: Duration = Duration::from_secs(5);
 
-/// Longest wait, once it is answered, for the other end to close.
+/// Upper limit for the wait, after the answer, until the other end closes.
 const LONGEST_CLOSE: Duration = Duration::from_secs(1);
-/// Most bytes that are read meanwhile: a request that is refused may continue.
+/// Upper limit for the bytes read during that wait: a refused request may still be arriving.
 const MOST_LEFT_BYTES: usize = 256 << 10;
 
 /// The head of a request.
@@ -25,30 +25,30 @@ const MOST_LEFT_BYTES: usize = 256 << 10;
 pub struct Head {
     /// `GET`, `POST` …
     pub method: String,
-    /// What is asked for, without the query.
+    /// The requested path, without the query.
     pub path: String,
-    /// The query behind the question mark, as it came.
+    /// The query after the question mark, undecoded.
     pub query: String,
-    /// Names in lower case, and values; bytes that are no text are replaced.
+    /// Names in lower case, and values; invalid UTF-8 is replaced.
     headers: Vec<(String, String)>,
-    /// Bytes that came behind the head.
+    /// Bytes received after the head.
     pub rest: Vec<u8>,
 }
 
 impl Head {
-    /// The only value of a header; `None` where it is missing or comes twice.
+    /// The value of a header; `None` if it is missing or repeated.
     pub fn header(&self, name: &str) -> Option<&str> {
         let mut found = self.headers.iter().filter(|(of, _)| of == name);
         let value = found.next().map(|(_, value)| value.as_str());
         if found.next().is_some() { None } else { value }
     }
 
-    /// Whether there is such a header.
+    /// Whether the header is present.
     pub fn has(&self, name: &str) -> bool {
         self.headers.iter().any(|(of, _)| of == name)
     }
 
-    /// Whether a list in a header, separated by commas, names `word`.
+    /// Whether a header's comma-separated list contains `word`.
     pub fn lists(&self, name: &str, word: &str) -> bool {
         let values = self.headers.iter().filter(|(of, _)| of == name);
         values
@@ -56,20 +56,20 @@ impl Head {
             .any(|of| of.trim().eq_ignore_ascii_case(word))
     }
 
-    /// A parameter of the query. No value that is used needs decoding.
+    /// A parameter of the query. None of the values used needs decoding.
     pub fn parameter(&self, name: &str) -> Option<&str> {
         let mut pairs = self.query.split('&').filter_map(|pair| pair.split_once('='));
         pairs.find(|(of, _)| *of == name).map(|(_, value)| value)
     }
 
-    /// A cookie.
+    /// The value of a cookie.
     pub fn cookie(&self, name: &str) -> Option<&str> {
         let mut pairs =
             self.header("cookie")?.split(';').filter_map(|pair| pair.trim().split_once('='));
         pairs.find(|(of, _)| *of == name).map(|(_, value)| value)
     }
 
-    /// Whether it wants to become a WebSocket.
+    /// Whether the client requests an upgrade to a WebSocket.
     pub fn is_upgrade(&self) -> bool {
         self.lists("upgrade", "websocket") && self.lists("connection", "upgrade")
     }
@@ -79,20 +79,20 @@ impl Head {
 #[derive(Debug, thiserror::Error)]
 pub enum HeadError {
     /// It is too long.
-    #[error("the head of the request has more than {MAX_HEAD_BYTES} bytes or {MAX_HEADERS} lines")]
+    #[error("the request head has more than {MAX_HEAD_BYTES} bytes or {MAX_HEADERS} lines")]
     TooLong,
-    /// It is no HTTP.
-    #[error("not a request of HTTP/1.1 ({0})")]
+    /// It is not HTTP.
+    #[error("not an HTTP/1.1 request ({0})")]
     Malformed(httparse::Error),
-    /// It did not come in time.
-    #[error("the head of the request did not come within {LONGEST_HEAD:?}")]
+    /// It did not arrive in time.
+    #[error("the request head did not arrive within {LONGEST_HEAD:?}")]
     Late,
-    /// The connection fails.
+    /// The connection failed.
     #[error(transparent)]
     Connection(#[from] io::Error),
 }
 
-/// The head at the beginning of `bytes`; `None` where it is not whole yet.
+/// Parses the head at the start of `bytes`; `None` if it is incomplete.
 pub fn parse_head(bytes: &[u8]) -> Result<Option<Head>, HeadError> {
     let mut headers = [httparse::EMPTY_HEADER; MAX_HEADERS];
     let mut request = httparse::Request::new(&mut headers);
@@ -122,7 +122,7 @@ pub fn parse_head(bytes: &[u8]) -> Result<Option<Head>, HeadError> {
     }))
 }
 
-/// Reads the head of a request; `None` where the other end closes before it says anything.
+/// Reads the head of a request; `None` if the other end closes before sending anything.
 pub fn read_head(stream: &mut TcpStream) -> Result<Option<Head>, HeadError> {
     let end = Instant::now() + LONGEST_HEAD;
     let mut bytes = Vec::new();
@@ -147,38 +147,38 @@ pub fn read_head(stream: &mut TcpStream) -> Result<Option<Head>, HeadError> {
     }
 }
 
-/// An answer; the connection is closed behind it.
+/// An answer, after which the connection is closed.
 #[derive(Debug, Clone)]
 pub struct Answer<'a> {
     /// Code and reason, `200 OK`.
     pub status: &'static str,
     /// Type of the content.
     pub content_type: &'static str,
-    /// Further header lines, each with its end.
+    /// Further header lines, each with its line end.
     pub headers: String,
     /// The content.
     pub body: Cow<'a, [u8]>,
 }
 
 impl<'a> Answer<'a> {
-    /// Content that is there.
+    /// A successful answer.
     pub fn ok(content_type: &'static str, body: impl Into<Cow<'a, [u8]>>) -> Self {
         Self { status: "200 OK", content_type, headers: String::new(), body: body.into() }
     }
 
-    /// An object that is there.
+    /// A successful answer with JSON content.
     pub fn json(value: &Value) -> Self {
         Self::ok("application/json", value.to_string().into_bytes())
     }
 
-    /// A line of text that says what is wrong.
+    /// A one-line text that explains an error.
     pub fn refusal(status: &'static str, text: impl Display) -> Self {
         Self { status, ..Self::ok("text/plain; charset=utf-8", format!("{text}\n").into_bytes()) }
     }
 
-    /// Sends it; without the content where only the head was asked for.
+    /// Sends the answer, without its content if only the head was requested.
     pub fn send(&self, stream: &mut TcpStream, is_head_only: bool) -> io::Result<()> {
-        // Nothing from elsewhere, no frame around it, no guessing of types, no address handed on.
+        // Allow no content from elsewhere, no framing, no type sniffing, no referrer.
         let head = format!(
             "HTTP/1.1 {}\r\nContent-Type: {}\r\nContent-Length: {}\r\nConnection: close\r\n\
              Cache-Control: no-store\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
@@ -198,7 +198,7 @@ impl<'a> Answer<'a> {
     }
 }
 
-/// Closes in order: bytes that nobody has read would take the answer with them.
+/// Closes gracefully: unread bytes would reset the connection and lose the answer.
 fn close(stream: &mut TcpStream) -> io::Result<()> {
     stream.shutdown(Shutdown::Write)?;
     let end = Instant::now() + LONGEST_CLOSE;
@@ -224,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn a_request_is_taken_apart() {
+    fn a_request_is_parsed_into_its_parts() {
         let text = "GET /a?token=ab&x=1 HTTP/1.1\r\nHost: robot:1\r\nCookie: a=1; b=2\r\n\
                     Connection: keep-alive, Upgrade\r\nUpgrade: websocket\r\n\r\nrest";
         let head = head(text);
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn a_header_that_comes_twice_is_not_believed() {
+    fn a_repeated_header_is_not_trusted() {
         let head = head("GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n");
         assert_eq!(head.header("host"), None);
     }

@@ -9,22 +9,22 @@ use semidense::wire::message::{HISTOGRAM_BUCKETS, HealthMessage};
 
 use crate::web::scene::State;
 
-/// Type of the text.
+/// Content type of the text.
 pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
-/// States of a process.
+/// Number of process states.
 const PROCESS_STATES: u32 = 7;
 
-/// A counter or gauge of a process: name, what it is, value.
+/// A counter or gauge of a process: name, description, value.
 type Figure = (&'static str, &'static str, fn(&HealthMessage) -> f64);
 
 const COUNTERS: [Figure; 8] = [
     ("frames", "Frames sent (capture), tracked (tracker) or mapped (mapper)", |h| h.frames as f64),
-    ("frames_dropped", "Frames that came too late to be handled", |h| h.dropped as f64),
+    ("frames_dropped", "Frames that arrived too late to be handled", |h| h.dropped as f64),
     ("frame_gaps", "Frames that the source lost", |h| h.gaps as f64),
-    ("messages_refused", "Broken messages or images that were left out", |h| h.refused as f64),
+    ("messages_refused", "Invalid messages or images that were left out", |h| h.refused as f64),
     (
         "frames_disordered",
-        "Frames whose sequence or stamp does not come after the one before",
+        "Frames whose sequence or stamp is not later than the previous one",
         |h| h.disordered as f64,
     ),
     ("image_size_changes", "Changes of the image size or the intrinsics", |h| h.resized as f64),
@@ -37,7 +37,7 @@ const COUNTERS: [Figure; 8] = [
 const GAUGES: [Figure; 4] = [
     ("frame_rate_hertz", "Frames a second over about the last second", |h| h.rate_hz),
     ("uptime_seconds", "Time since the process started", |h| secs_since(h.started_nanos)),
-    ("report_age_seconds", "Time since the process said something", |h| {
+    ("report_age_seconds", "Time since the process last reported", |h| {
         secs_since(h.published_nanos)
     }),
     ("peak_resident_bytes", "Largest resident memory so far", |h| h.peak_rss_bytes as f64),
@@ -55,28 +55,30 @@ const MAPPER_COUNTERS: [Figure; 7] = [
         "Joint estimates that were dropped because the map had changed",
         |h| h.adjustments_dropped as f64,
     ),
-    ("loop_searches", "Keyframes that were looked for in older ones", |h| h.loop_searches as f64),
-    ("loops_closed", "Loops that moved the map", |h| h.loops_closed as f64),
-    ("loops_held", "Loops that the map already had so", |h| h.loops_held as f64),
+    ("loop_searches", "Keyframes that were searched for in older ones", |h| h.loop_searches as f64),
+    ("loops_closed", "Loops that corrected the map", |h| h.loops_closed as f64),
+    ("loops_held", "Loops that the map already satisfied", |h| h.loops_held as f64),
     ("epochs_joined", "Epochs that were joined to others", |h| h.epochs_joined as f64),
 ];
 
-/// A histogram of a process: name, what it is, counts.
+/// A histogram of a process: name, description, counts.
 type Histogram = (&'static str, &'static str, fn(&HealthMessage) -> &[u64; HISTOGRAM_BUCKETS]);
 
 const HISTOGRAMS: [Histogram; 3] = [
-    ("latency_seconds", "From the frame's stamp to what the process made of it", |h| {
+    ("latency_seconds", "From the frame's stamp to the output of the process", |h| {
         &h.latency_counts
     }),
     ("work_seconds", "Time that the work on a frame took", |h| &h.work_counts),
-    ("wake_seconds", "From the sending of a frame to the look at it", |h| &h.wake_counts),
+    ("wake_seconds", "From the sending of a frame until the process looks at it", |h| {
+        &h.wake_counts
+    }),
 ];
 
 fn secs_since(nanos: i64) -> f64 {
     now_nanos().saturating_sub(nanos).max(0) as f64 * 1e-9
 }
 
-/// The text; `pages` and `lost` are of the server itself.
+/// The OpenMetrics text; `pages` and `lost` are those of the server itself.
 pub fn metrics(state: &State, instance: &str, pages: usize, lost: u64) -> String {
     let mut text = Text::default();
     text.describe("info", "semidense", "The instance and where its frames come from");
@@ -145,8 +147,8 @@ fn of_poses(text: &mut Text, state: &State) {
     let gauges = [
         ("pose_age_seconds", "Time since the newest pose was published", age),
         ("pose_in_view_ratio", "Share of the keyframe's points in view", pose.in_view_ratio),
-        ("pose_inlier_ratio", "Share of those compared that are explained", pose.inlier_ratio),
-        ("epoch", "Life of the map", f64::from(pose.epoch)),
+        ("pose_inlier_ratio", "Share of the compared points that are explained", pose.inlier_ratio),
+        ("epoch", "Epoch of the map", f64::from(pose.epoch)),
         ("map_revision", "How often the map had been corrected", pose.map_revision as f64),
     ];
     for (name, help, value) in gauges {
@@ -154,12 +156,12 @@ fn of_poses(text: &mut Text, state: &State) {
     }
 }
 
-/// The text as it grows.
+/// The text under construction.
 #[derive(Debug, Default)]
 struct Text(String);
 
 impl Text {
-    /// A family of counters or gauges: each value with its labels.
+    /// Adds a family of counters or gauges: each value with its labels.
     fn family<'a, const N: usize>(
         &mut self,
         kind: &str,
@@ -190,8 +192,8 @@ impl Text {
         let _ = writeln!(self.0, " {value}");
     }
 
-    /// Buckets as Prometheus has them, each with all below it. Times are counted by half octaves and not summed: the sum
-    /// takes each to be in the middle of its bucket, right to a few percent.
+    /// Adds Prometheus buckets, each of which includes all below it. Times are counted by half octaves and
+    /// not summed: the sum takes each to be at the middle of its bucket, accurate to a few per cent.
     fn histogram(&mut self, name: &str, process: &str, counts: &[u64; HISTOGRAM_BUCKETS]) {
         let (mut below, mut sum) = (0_u64, 0.0);
         for (index, count) in counts.iter().enumerate() {
@@ -199,7 +201,7 @@ impl Text {
             let end = bucket_end_ms(index) * 1e-3;
             let begin = if index == 0 { 0.0 } else { bucket_end_ms(index - 1) * 1e-3 };
             sum += *count as f64 * 0.5 * (begin + end);
-            // The last one holds all from its beginning on.
+            // The last bucket is open-ended.
             let le = if index + 1 == HISTOGRAM_BUCKETS {
                 "+Inf".to_owned()
             } else {
@@ -218,7 +220,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn buckets_hold_all_below_them() {
+    fn buckets_are_cumulative() {
         let mut counts = [0; HISTOGRAM_BUCKETS];
         (counts[0], counts[20], counts[HISTOGRAM_BUCKETS - 1]) = (2, 3, 5);
         let mut text = Text::default();

@@ -1,5 +1,5 @@
-//! A keyframe's depth as eight bytes a point, which the page's graphics card unprojects: u, v, inverse depth, brightness,
-//! relative deviation.
+//! A keyframe's depth in eight bytes per point, unprojected by the page's GPU: u, v, inverse depth,
+//! brightness, relative deviation.
 
 use std::sync::Arc;
 
@@ -7,16 +7,16 @@ use semidense::service::results::report::scene::{POINT_BYTES, deviation_code, ev
 use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use serde_json::{Value, json};
 
-/// A keyframe for pages.
+/// A keyframe packed for pages.
 #[derive(Debug, Clone)]
 pub struct Packed {
-    /// Its id.
+    /// Id of the keyframe.
     pub keyframe_id: u64,
     /// Revision of its depth.
     pub revision: u64,
-    /// Camera, size and what the numbers mean.
+    /// Camera, size and scale of the encoded numbers.
     pub header: Value,
-    /// Its points, in an order of which any beginning is an even sample.
+    /// The points, in an order of which any prefix is an even sample.
     pub points: Arc<[u8]>,
 }
 
@@ -33,7 +33,7 @@ impl Packed {
             let point = points[index];
             let inverse_depth = f64::from(point.inverse_depth);
             let relative = f64::from(point.variance).sqrt() / inverse_depth;
-            // At least one: 0 stands for no depth.
+            // At least 1: 0 denotes no depth.
             let code = (inverse_depth / step).round().clamp(1.0, f64::from(u16::MAX)) as u16;
             for number in [point.u, point.v, code] {
                 bytes.extend_from_slice(&number.to_le_bytes());
@@ -62,7 +62,7 @@ impl Packed {
         }
     }
 
-    /// How many points it has.
+    /// The number of points.
     pub fn num_points(&self) -> usize {
         self.points.len() / POINT_BYTES
     }
@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn inverse_depth_survives_to_a_part_in_65535_of_the_nearest() {
+    fn inverse_depth_is_accurate_to_a_part_in_65535_of_the_nearest() {
         let packed = Packed::of(&keyframe(&[0.5, 2.0, f32::NAN, 0.0, -1.0, 1e-9]));
         assert_eq!(packed.num_points(), 3, "what is no depth is left out");
         let step = packed.header["depthStep"].as_f64().unwrap();

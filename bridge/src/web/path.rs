@@ -1,15 +1,15 @@
-//! The camera's path so far, each pose relative to its keyframe, so that it follows the map's corrections.
+//! The camera's path so far, each pose relative to its keyframe, so that it follows corrections of the map.
 
 use semidense::slam::pose::NO_KEYFRAME;
 
 use crate::session::Pose;
 
-/// Poses that are kept: half an hour at 30 Hz. Beyond that every second one is given up.
+/// Upper limit for the poses kept: half an hour at 30 Hz. Beyond it, every second one is removed.
 const MAX_POSES: usize = 1 << 16;
 /// Bytes of a pose in a message.
 const POSE_BYTES: usize = 32;
 
-/// One pose.
+/// A pose of the path.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct PathPose {
     secs: f64,
@@ -19,14 +19,14 @@ struct PathPose {
     state: u32,
 }
 
-/// The path.
+/// The camera's path.
 #[derive(Debug, Default)]
 pub struct Path {
     poses: Vec<PathPose>,
-    /// Of the poses that come, each how-many-th is kept.
+    /// One of this many incoming poses is kept.
     every: u64,
     seen: u64,
-    /// Counts how often poses were given up: what was sent before is void.
+    /// Number of thinnings: each invalidates what was sent before.
     pub generation: u64,
 }
 
@@ -61,12 +61,12 @@ impl Path {
         }
     }
 
-    /// How many poses it has.
+    /// The number of poses.
     pub fn num_poses(&self) -> usize {
         self.poses.len()
     }
 
-    /// The poses from number `from` on: seconds f64, position f32 x 3, keyframe, epoch and state u32.
+    /// The poses from index `from`: seconds f64, position f32 x 3, keyframe, epoch and state u32.
     pub fn bytes_from(&self, from: usize) -> Vec<u8> {
         let poses = self.poses.get(from..).unwrap_or_default();
         let mut bytes = Vec::with_capacity(poses.len() * POSE_BYTES);

@@ -1,4 +1,4 @@
-//! The button that saves the map: the mapper is asked to, as by `semidense map save`.
+//! The button that saves the map through the mapper, as `semidense map save` does.
 
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -12,27 +12,27 @@ use semidense::wire::place::Place;
 use semidense::wire::port::{Access, Hub, OpenError};
 use semidense::wire::topic::MAPPER_HEALTH;
 
-/// Longest time that saving may take: a map of an hour on a slow card.
+/// Upper limit for the time to save: a map of an hour on a slow card.
 const LONGEST_SAVE: Duration = Duration::from_secs(120);
 
 /// Why the map was not saved.
 #[derive(Debug, thiserror::Error)]
 pub enum SaveError {
-    /// It is being saved.
-    #[error("the map is being saved already")]
+    /// A save is in progress.
+    #[error("the map is already being saved")]
     Busy,
-    /// There is no folder for it.
-    #[error("cannot make a folder for maps in {path}: {source}; name another one with --maps")]
+    /// A folder for the map cannot be created.
+    #[error("cannot create a folder for maps in {path}: {source}; name another one with --maps")]
     Folder {
         /// The folder.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Nothing runs.
+    /// No instance is running.
     #[error(transparent)]
     Open(#[from] OpenError),
-    /// The mapper does not.
+    /// The mapper failed or refused.
     #[error(transparent)]
     Command(#[from] CommandError),
 }
@@ -46,12 +46,12 @@ pub struct Saver {
 }
 
 impl Saver {
-    /// Saves what the instance at `place` has mapped, below `folder`.
+    /// Saves maps of the instance at `place` into new folders below `folder`.
     pub fn new(place: Place, folder: &Path) -> Self {
         Self { place, folder: folder.to_owned(), busy: Mutex::new(()) }
     }
 
-    /// Saves the map, and says where. The folder is ours to choose: a page cannot name one.
+    /// Saves the map and returns its folder. The server chooses the folder: a page cannot name one.
     pub fn save(&self) -> Result<PathBuf, SaveError> {
         let _busy = self.busy.try_lock().map_err(|_| SaveError::Busy)?;
         let hub = Hub::join(&self.place, "view-save", Access::Observer)?;

@@ -1,6 +1,6 @@
-//! What pages show, kept up to date from the feed by one thread, and read by the thread of each page.
+//! What pages show: updated from the feed by one thread, read by the thread of each page.
 //!
-//! Pages take what is newest when they can take something: nothing is queued for them here.
+//! A page fetches the newest state when it has room: nothing is queued here.
 
 use std::collections::{BTreeMap, HashSet};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
@@ -16,14 +16,14 @@ use crate::web::packing::Packed;
 use crate::web::path::Path;
 use crate::web::seats::{Seat, Seats};
 
-/// Shortest time between two revisions of the active keyframe: each is half a megabyte for every page.
+/// Minimum time between two revisions of the active keyframe: each is half a megabyte for every page.
 const REVISION_PERIOD: Duration = Duration::from_secs(1);
-/// Time without a pose from which on images are shown without.
+/// Time without a pose after which images are shown without one.
 const LONGEST_WAIT: Duration = Duration::from_millis(500);
-/// Points that are kept of all keyframes together where it is not said otherwise: 48 MB here and in each page.
+/// Default limit for the points of all keyframes together: 48 MB here and in each page.
 pub const USUAL_POINTS: usize = 6_000_000;
 
-/// What pages show.
+/// The scene that pages show.
 #[derive(Debug)]
 pub struct Scene {
     state: Mutex<State>,
@@ -36,11 +36,11 @@ pub struct Scene {
 pub struct NewestFrame {
     /// The image.
     pub frame: Arc<Frame>,
-    /// Its own pose; `None` where no poses come.
+    /// The pose of this frame; `None` if no poses arrive.
     pub pose: Option<Arc<Pose>>,
-    /// Counts up with every one.
+    /// Incremented with every frame.
     pub number: u64,
-    /// The image as JPEG, once a page has wanted it.
+    /// The image as JPEG, once a page has requested it.
     pub jpeg: Arc<OnceLock<Vec<u8>>>,
 }
 
@@ -48,40 +48,40 @@ pub struct NewestFrame {
 #[derive(Debug, Default)]
 pub struct State {
     max_points: usize,
-    /// Counts up with every change.
+    /// Incremented with every change.
     pub version: u64,
-    /// Counts up with every run that is joined.
+    /// Incremented with every run that is joined.
     pub run: u64,
-    /// Whether an instance is there.
+    /// Whether an instance is running.
     pub is_joined: bool,
     /// Keyframes with depth, by id.
     pub keyframes: BTreeMap<u64, Arc<Packed>>,
-    /// Where keyframes are, by id; of all that the map has or had.
+    /// Poses of the keyframes, by id; of all that the map contains or contained.
     places: BTreeMap<u64, (u32, KeyframePose)>,
-    /// Counts up with every change of the places.
+    /// Incremented with every change of these poses.
     pub placed: u64,
-    /// The active keyframe as it came last, where it is not packed yet.
+    /// The newest version of the active keyframe, while not packed.
     active: Option<Arc<Keyframe>>,
-    /// The keyframe that poses refer to now.
+    /// The keyframe that poses currently refer to.
     pub active_id: Option<u64>,
     packed: Option<Instant>,
     /// The camera's path.
     pub path: Path,
-    /// The newest pose, and how many came.
+    /// The newest pose, and the number of poses so far.
     pub pose: Option<(u64, Arc<Pose>)>,
-    /// The newest frame whose pose is known.
+    /// The newest frame with a known pose.
     pub frame: Option<NewestFrame>,
-    /// A frame that waits for its pose, which comes some milliseconds later.
+    /// A frame whose pose has not arrived; it follows some milliseconds later.
     waiting: Option<Arc<Frame>>,
-    /// When the newest pose came, or else the run began.
+    /// When the newest pose arrived, or else the run began.
     posed: Option<Instant>,
-    /// What each process says of itself, and how many such messages came.
+    /// The newest health report of each process.
     pub health: BTreeMap<&'static str, HealthMessage>,
-    /// Counts up with every report.
+    /// Incremented with every report.
     pub reports: u64,
-    /// Poses by the state that they were in, for `/metrics`.
+    /// Number of poses by tracking state, for `/metrics`.
     pub poses_by_state: [u64; 4],
-    /// Why keyframes of before cannot be had; empty where they can, or are not wanted.
+    /// Why earlier keyframes are not available; empty if they are, or are not wanted.
     pub history_note: String,
     refused: HashSet<(u64, u64)>,
 }
@@ -98,12 +98,12 @@ impl State {
                 self.is_joined = true;
             }
             Event::Left => {
-                // What was seen stays in view until another run begins.
+                // Keep showing what was seen until another run begins.
                 self.pack_active();
                 (self.is_joined, self.frame, self.waiting) = (false, None, None);
             }
             Event::Frame(frame) => {
-                // One that the tracker has left out is left out here, unless nothing is tracked at all.
+                // Frames that the tracker skipped are skipped here too, unless nothing is tracked at all.
                 let before = self.waiting.replace(frame);
                 if self.posed.is_some_and(|at| at.elapsed() > LONGEST_WAIT) {
                     before.into_iter().for_each(|frame| self.show(frame, None));
@@ -142,7 +142,7 @@ impl State {
 
     fn take_keyframe(&mut self, keyframe: Arc<Keyframe>, has_pages: bool) {
         if self.active_id.is_some_and(|id| id != keyframe.keyframe_id) {
-            // The last of the one before.
+            // The last revision of the previous one.
             self.pack_active();
             self.packed = None;
         }
@@ -162,14 +162,14 @@ impl State {
         self.keep(&keyframe);
     }
 
-    /// Packs a keyframe, and thins all where they are too many together.
+    /// Packs a keyframe, and thins all of them if they exceed the limit together.
     pub(super) fn keep(&mut self, keyframe: &Keyframe) {
         let packed = Packed::of(keyframe);
         self.keyframes.insert(packed.keyframe_id, Arc::new(packed));
         self.version += 1;
         let total: usize = self.keyframes.values().map(|packed| packed.num_points()).sum();
         if total > self.max_points {
-            // An eighth of room for the next ones, so that this is not done for every one.
+            // Leaves an eighth of room, so that this is not repeated for every keyframe.
             let most = (self.max_points / self.keyframes.len()) * 7 / 8;
             for packed in self.keyframes.values_mut().filter(|packed| packed.num_points() > most) {
                 *packed = Arc::new(packed.thinned(most));
@@ -181,7 +181,7 @@ impl State {
         for pose in &graph.poses {
             self.place(graph.header.epoch, *pose);
         }
-        // Of its epoch, what it does not name is not in the map any more.
+        // Keyframes of this epoch that the graph does not name have left the map.
         let named: HashSet<u64> = graph.poses.iter().map(|pose| pose.keyframe_id).collect();
         let epoch = graph.header.epoch;
         let active = self.active_id;
@@ -194,7 +194,7 @@ impl State {
         self.placed += 1;
     }
 
-    /// Where keyframes are, 40 bytes each: id, epoch, and translation, quaternion and unit as f32.
+    /// The poses of the keyframes, 40 bytes each: id, epoch, and translation, quaternion and unit as f32.
     pub fn places_bytes(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(self.places.len() * 40);
         for (epoch, pose) in self.places.values() {
@@ -207,8 +207,8 @@ impl State {
         bytes
     }
 
-    /// Keyframes whose depth the map has in another revision than pages: those that were not seen at all first, the newest
-    /// of them first, which the camera sees; then those that are furthest behind.
+    /// Keyframes whose depth is newer in the map than on pages: first those never received, starting with the
+    /// newest, which the camera sees; then those furthest behind.
     pub fn missing(&self) -> Vec<u64> {
         let mut missing: Vec<(u64, u64)> = self
             .places
@@ -226,14 +226,14 @@ impl State {
         missing.into_iter().map(|(_, id)| id).collect()
     }
 
-    /// The mapper does not have the depth of this keyframe: it is not asked for again until it changes.
+    /// The mapper does not have the depth of this keyframe: it is not requested again until it changes.
     pub(super) fn give_up(&mut self, keyframe_id: u64) {
         if let Some((_, pose)) = self.places.get(&keyframe_id) {
             self.refused.insert((keyframe_id, pose.revision));
         }
     }
 
-    /// What changes rarely: whether a run is there, and how many keyframes are known.
+    /// State that changes rarely: whether a run is joined, and the number of keyframes.
     pub fn run_json(&self) -> Value {
         json!({
             "kind": "run",
@@ -248,30 +248,30 @@ impl State {
 }
 
 impl Scene {
-    /// An empty one, which keeps `max_points` at most.
+    /// An empty scene that keeps at most `max_points`.
     pub fn new(max_points: usize) -> Self {
         let state = Mutex::new(State::new(max_points, 0, 0));
         Self { state, changed: Condvar::new(), pages: Seats::default() }
     }
 
-    /// Its state.
+    /// Locks the state.
     pub fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes in an event.
+    /// Applies an event.
     pub fn take(&self, event: Event) {
         self.lock().take(event, self.pages() > 0);
         self.changed.notify_all();
     }
 
-    /// Tells those who wait that something was changed from outside.
+    /// Wakes waiting pages after a change from outside.
     pub fn tell(&self) {
         self.lock().version += 1;
         self.changed.notify_all();
     }
 
-    /// Waits until its version is another one than `version`, or for `timeout` at most.
+    /// Waits until the version differs from `version`, at most for `timeout`.
     pub fn wait(&self, version: u64, timeout: Duration) -> MutexGuard<'_, State> {
         let state = self.lock();
         let waited =
@@ -279,12 +279,12 @@ impl Scene {
         waited.unwrap_or_else(PoisonError::into_inner).0
     }
 
-    /// Pages that are open.
+    /// Number of open pages.
     pub fn pages(&self) -> usize {
         self.pages.taken()
     }
 
-    /// Counts a page while it is open: a page that comes gets the active keyframe at once. `None` where `most` are open.
+    /// Counts a page while it is open and gives it the active keyframe at once. `None` if `most` are open.
     pub fn open_page(&self, most: usize) -> Option<Seat> {
         let page = self.pages.take(most)?;
         self.lock().pack_active();
@@ -318,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_page_a_keyframe_is_packed_once_it_is_left() {
+    fn without_a_page_a_keyframe_is_packed_once_it_is_no_longer_active() {
         let scene = Scene::new(1000);
         scene.take(Event::Joined);
         scene.take(Event::Keyframe(keyframe(1, 1, 10)));
@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn all_keyframes_together_stay_within_the_points_that_are_allowed() {
+    fn all_keyframes_together_stay_within_the_limit_of_points() {
         let scene = Scene::new(1000);
         let _page = scene.open_page(1);
         (0..20).for_each(|id| scene.take(Event::Keyframe(keyframe(id, id, 400))));
@@ -344,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_map_has_newer_is_missing_until_the_mapper_says_no() {
+    fn newer_revisions_of_the_map_are_missing_until_the_mapper_refuses() {
         let scene = Scene::new(1000);
         scene.take(Event::Keyframe(keyframe(1, 1, 5)));
         scene.take(Event::Keyframe(keyframe(4, 4, 5)));
@@ -359,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_begins_takes_the_place_of_the_one_before() {
+    fn a_new_run_replaces_the_previous_one() {
         let scene = Scene::new(1000);
         scene.take(Event::Joined);
         scene.take(Event::Keyframe(keyframe(1, 1, 5)));

@@ -1,4 +1,4 @@
-//! One port for the page, its stream, `/metrics` and Foxglove: each connection has a thread, and there are few of them.
+//! One port for the page, its stream, `/metrics` and Foxglove: a thread per connection, with few connections.
 
 use std::fmt::Display;
 use std::io;
@@ -24,17 +24,17 @@ use crate::web::scene::Scene;
 use crate::web::seats::Seats;
 use crate::web::stream::{StreamOptions, serve as serve_stream};
 
-/// Connections at a time, those that only ask for a file included.
+/// Upper limit for concurrent connections, including those that only request a file.
 const MAX_CONNECTIONS: usize = 64;
-/// Pages with a live stream at a time: each may take 5 MB/s.
+/// Upper limit for pages with a live stream: each may take 5 MB/s.
 const MAX_PAGES: usize = 8;
-/// Longest time that a file may take to be taken.
+/// Upper limit for the time that sending a file may take.
 const LONGEST_ANSWER: Duration = Duration::from_secs(30);
-/// Largest message that a page or Foxglove may send, bytes: what they say is some hundred.
+/// Upper limit for a message from a page or Foxglove, bytes: they send a few hundred.
 const MAX_MESSAGE_BYTES: usize = 64 << 10;
-/// Pause after a connection that could not be taken: too many files are open.
+/// Pause after a failure to accept a connection: too many files are open.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
-/// Clients of Foxglove's protocol at a time: each has its own messages encoded.
+/// Upper limit for clients of Foxglove's protocol: messages are encoded for each.
 const MAX_FOXGLOVE: usize = 8;
 
 const NOT_FOUND: &str = "404 Not Found";
@@ -42,7 +42,7 @@ const CONFLICT: &str = "409 Conflict";
 const UNAVAILABLE: &str = "503 Service Unavailable";
 
 const SCRIPT: &str = "text/javascript; charset=utf-8";
-/// The files of the page, in the program itself.
+/// The files of the page, embedded in the program.
 const FILES: [(&str, &str, &str); 7] = [
     ("/", "text/html; charset=utf-8", include_str!("assets/index.html")),
     ("/page.css", "text/css; charset=utf-8", include_str!("assets/page.css")),
@@ -53,57 +53,57 @@ const FILES: [(&str, &str, &str); 7] = [
     ("/viewer.js", SCRIPT, VIEWER),
 ];
 
-/// What is shown.
+/// What the server shows.
 #[derive(Debug)]
 pub enum Shown {
-    /// What runs.
+    /// A running instance.
     Live {
-        /// The topics.
+        /// The topics of the instance.
         feed: Feed,
-        /// What pages show of them.
+        /// The scene that pages show.
         scene: Arc<Scene>,
-        /// How a page is served.
+        /// Settings of the page streams.
         stream: StreamOptions,
         /// Saves the map.
         saver: Saver,
     },
-    /// A run that is over, packed for the page, its folder and its summary.
+    /// A finished run, packed for the page, with its folder and summary.
     Finished(Vec<u8>, PathBuf, serde_json::Value),
 }
 
-/// Why the server does not start.
+/// Why the server cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
-    /// The port is taken, or the address is not of this machine.
+    /// The port is in use, or the address is not one of this machine.
     #[error("cannot listen on {address}: {source}; choose another one with --listen ADDRESS:PORT")]
     Listen {
         /// The address.
         address: SocketAddr,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
-    /// No thread can be started.
+    /// A thread cannot be started.
     #[error("cannot start a thread ({0})")]
     Thread(#[from] io::Error),
 }
 
-/// The server.
+/// The web server.
 #[derive(Debug)]
 pub struct Server {
     listener: TcpListener,
-    /// Where it listens.
+    /// The address it listens on.
     pub address: SocketAddr,
     guard: Guard,
     /// What is shown.
     pub shown: Shown,
     connections: Seats,
     foxglove_clients: Seats,
-    /// Becomes true when everything shall end.
+    /// Set to true to end all streams and the requests for missing keyframes.
     pub is_over: AtomicBool,
 }
 
 impl Server {
-    /// Listens on an address; port 0 takes any that is free.
+    /// Listens on an address; port 0 selects a free one.
     pub fn open(address: SocketAddr, guard: Guard, shown: Shown) -> Result<Arc<Self>, ServerError> {
         let failed = |source| ServerError::Listen { address, source };
         let listener = TcpListener::bind(address).map_err(failed)?;
@@ -119,7 +119,7 @@ impl Server {
         }))
     }
 
-    /// Takes connections on a thread of its own, for as long as the process lives.
+    /// Accepts connections on a separate thread for the life of the process.
     pub fn start(self: &Arc<Self>) -> Result<(), ServerError> {
         let server = Arc::clone(self);
         std::thread::Builder::new().name("accept".to_owned()).spawn(move || {
@@ -127,7 +127,7 @@ impl Server {
                 match server.listener.accept() {
                     Ok((stream, _)) => server.take(stream),
                     Err(error) => {
-                        tracing::warn!("a connection cannot be taken ({error})");
+                        tracing::warn!("cannot accept a connection ({error})");
                         std::thread::sleep(ACCEPT_PAUSE);
                     }
                 }
@@ -144,7 +144,7 @@ impl Server {
         };
         let server = Arc::clone(self);
         let thread = std::thread::Builder::new().name("client".to_owned());
-        // A thread that cannot be started drops the connection.
+        // If the thread cannot be started, the connection is dropped.
         let _ = thread.spawn(move || {
             let _seat = seat;
             server.answer(stream);
@@ -165,7 +165,7 @@ impl Server {
             }
         };
         if let Err(error) = outcome {
-            tracing::debug!("a client is gone: {error}");
+            tracing::debug!("a client disconnected: {error}");
         }
     }
 
@@ -204,12 +204,12 @@ impl Server {
             _ => {}
         }
         let Some((_, content_type, text)) = FILES.iter().find(|(name, ..)| *name == path) else {
-            let text = "there is no such page: / is the page, /metrics for Prometheus";
+            let text = "no such page: / is the live page, /metrics is for Prometheus";
             return Answer::refusal(NOT_FOUND, text);
         };
         let mut answer = Answer::ok(content_type, text.as_bytes());
         if let (Some(token), true) = (&self.guard.token, path == "/") {
-            // So that the page's own requests need no token in their address.
+            // So that the page's own requests need no token in their URL.
             answer.headers =
                 format!("Set-Cookie: {COOKIE}={token}; Path=/; HttpOnly; SameSite=Strict\r\n");
         }
@@ -226,7 +226,7 @@ impl Server {
         }
     }
 
-    /// A WebSocket: Foxglove's, which names a subprotocol, or the page's.
+    /// Serves a WebSocket: Foxglove's, which names a subprotocol, or the page's.
     fn upgrade(&self, mut stream: TcpStream, head: Head) -> io::Result<()> {
         let wanted = |name: &&str| head.lists("sec-websocket-protocol", name);
         if let Some(protocol) = SUBPROTOCOLS.into_iter().find(wanted) {
@@ -236,10 +236,10 @@ impl Server {
             return refuse(&mut stream, NOT_FOUND, "this run is over: there is no stream");
         };
         if head.path != "/stream" {
-            return refuse(&mut stream, NOT_FOUND, "the stream is /stream");
+            return refuse(&mut stream, NOT_FOUND, "the stream is at /stream");
         }
         let Some(_page) = scene.open_page(MAX_PAGES) else {
-            let text = format!("{MAX_PAGES} pages are open already: close one");
+            let text = format!("{MAX_PAGES} pages are already open: close one");
             return refuse(&mut stream, UNAVAILABLE, text);
         };
         let socket = accept(stream, head, None)?;
@@ -251,7 +251,7 @@ impl Server {
             return refuse(&mut stream, NOT_FOUND, "this run is over: nothing is sent");
         };
         let Some(_seat) = self.foxglove_clients.take(MAX_FOXGLOVE) else {
-            let text = format!("{MAX_FOXGLOVE} clients are served already: close one");
+            let text = format!("{MAX_FOXGLOVE} clients are already connected: close one");
             return refuse(&mut stream, UNAVAILABLE, text);
         };
         let socket = accept(stream, head, Some(protocol))?;
@@ -265,7 +265,7 @@ fn refuse(stream: &mut TcpStream, status: &'static str, text: impl Display) -> i
     Answer::refusal(status, text).send(stream, false)
 }
 
-/// Answers the request for a WebSocket, and makes one of the connection.
+/// Answers a WebSocket request and upgrades the connection.
 pub fn accept(
     mut stream: TcpStream,
     head: Head,
@@ -276,7 +276,7 @@ pub fn accept(
         .header("sec-websocket-key")
         .filter(|_| head.header("sec-websocket-version") == Some("13"));
     let Some(key) = key else {
-        refuse(&mut stream, "400 Bad Request", "a WebSocket of version 13 is wanted")?;
+        refuse(&mut stream, "400 Bad Request", "WebSocket version 13 is required")?;
         return Err(io::Error::from(io::ErrorKind::InvalidData));
     };
     let protocol =

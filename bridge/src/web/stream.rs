@@ -1,7 +1,7 @@
-//! What one page is sent, over its WebSocket.
+//! The stream to one page, over its WebSocket.
 //!
-//! A page gets what is newest when there is room for it: small messages as they come, images and keyframes only while few
-//! of those before are unanswered. One that takes nothing for some time is given up.
+//! A page receives the newest state when there is room for it: small messages at once, images and keyframes
+//! only while few earlier ones are unacknowledged. A page that accepts nothing for some time is disconnected.
 
 use std::collections::HashMap;
 use std::net::TcpStream;
@@ -20,45 +20,45 @@ use crate::web::packing::Packed;
 use crate::web::scene::{NewestFrame, Scene, State};
 use crate::web::words::{health_json, pose_json};
 
-/// Large messages that a page may have unanswered: enough to fill a link, few enough that what comes is new.
+/// Upper limit for unacknowledged large messages: enough to fill a link, few enough to keep what arrives new.
 const MAX_UNANSWERED: usize = 4;
-/// Longest time without a message in which answers and the end are looked for.
+/// Interval at which acknowledgements and the end are checked while there is nothing to send.
 const QUIET_PERIOD: Duration = Duration::from_millis(100);
 /// The same while there is more to send.
 const BUSY_PERIOD: Duration = Duration::from_millis(4);
-/// How long a look for an answer takes at most.
+/// Upper limit for one check for acknowledgements.
 const READ_TIME: Duration = Duration::from_millis(1);
-/// Longest time that a page may take nothing.
+/// Upper limit for the time that a page may accept nothing.
 const LONGEST_WRITE: Duration = Duration::from_secs(10);
-/// Time between two parts of the path.
+/// Period of updates of the path.
 const PATH_PERIOD: Duration = Duration::from_millis(200);
-/// Time between two tables of all keyframes' places: 40 bytes each.
+/// Period of the tables of all keyframes' poses, 40 bytes each.
 const PLACES_PERIOD: Duration = Duration::from_millis(200);
-/// Time between two revisions of the same keyframe.
+/// Minimum time between two revisions of the same keyframe.
 const REVISION_PERIOD: Duration = Duration::from_secs(1);
 /// Images wider than this are halved: the page shows them no larger.
 const MAX_IMAGE_WIDTH: usize = 800;
 
-/// How a page is served.
+/// Settings of a stream.
 #[derive(Debug, Clone)]
 pub struct StreamOptions {
     /// Name of the instance.
     pub instance: String,
-    /// Most images a second.
+    /// Maximum rate of images.
     pub image_rate_hz: f64,
 }
 
-/// What a page says.
+/// A message from a page.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 struct Said {
-    /// Large messages that it has taken in since it spoke last.
+    /// Large messages received since its last message.
     ack: usize,
     /// Whether it shows images.
     frames: Option<bool>,
 }
 
-/// Sends until the page is closed, fails to take anything, or `is_over`.
+/// Sends until the page is closed, accepts nothing for too long, or `is_over`.
 pub fn serve(
     mut socket: WebSocket<TcpStream>,
     scene: &Scene,
@@ -93,12 +93,12 @@ pub fn serve(
     socket.flush()
 }
 
-/// Takes in what the page has said; `false` when it is gone.
+/// Reads the page's messages; `false` once it is closed.
 fn listen(socket: &mut WebSocket<TcpStream>, sent: &mut Sent) -> Result<bool, Error> {
     loop {
         match socket.read() {
             Ok(Message::Text(said)) => {
-                // What is no word of ours says nothing.
+                // An unknown message is treated as empty.
                 let said: Said = serde_json::from_str(said.as_str()).unwrap_or_default();
                 sent.unanswered = sent.unanswered.saturating_sub(said.ack);
                 sent.shows_frames = said.frames.unwrap_or(sent.shows_frames);
@@ -114,12 +114,12 @@ fn listen(socket: &mut WebSocket<TcpStream>, sent: &mut Sent) -> Result<bool, Er
     }
 }
 
-/// A message that is only a header.
+/// A message that consists of a header only.
 fn text(header: &Value) -> Message {
     Message::text(header.to_string())
 }
 
-/// Something to send; the work of making it is done when the scene is not held any more.
+/// Something to send; encoded after the lock on the scene is released.
 enum Outgoing {
     Text(Value),
     Bytes(Value, Vec<u8>),
@@ -152,7 +152,7 @@ impl Outgoing {
     }
 }
 
-/// The image as JPEG, halved where it is wide; empty where it cannot be packed.
+/// The image as JPEG, halved if wide; empty if it cannot be encoded.
 fn jpeg_of(newest: &NewestFrame) -> Vec<u8> {
     let header = &newest.frame.header;
     let (mut width, mut height) = (header.width as usize, header.height as usize);
@@ -175,7 +175,7 @@ fn halved(pixels: &[u8], width: usize, height: usize) -> Vec<u8> {
     (0..height / 2).flat_map(|y| (0..width / 2).map(move |x| mean(2 * x, 2 * y))).collect()
 }
 
-/// What a page has been sent.
+/// What a page has received so far.
 #[derive(Debug, Default)]
 struct Sent {
     run: Option<u64>,
@@ -196,10 +196,10 @@ struct Sent {
 }
 
 impl Sent {
-    /// What is new for the page, the most urgent first, and at most one keyframe.
+    /// Collects what is new for the page, most urgent first, with at most one keyframe.
     fn collect(&mut self, state: &State, options: &StreamOptions, out: &mut Vec<Outgoing>) {
         if self.run != Some(state.run) {
-            // Everything before belongs to another run.
+            // The page's state belongs to another run.
             let (unanswered, shows_frames) = (self.unanswered, self.shows_frames);
             *self = Self { run: Some(state.run), unanswered, shows_frames, ..Self::default() };
         }
@@ -277,7 +277,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_image_is_halved_by_means() {
+    fn an_image_is_halved_by_averaging() {
         assert_eq!(halved(&[0, 4, 9, 8, 12, 9], 3, 2), [6]);
         assert_eq!(halved(&[1; 16], 4, 4), [1; 4]);
     }

@@ -1,4 +1,4 @@
-//! Poses and health in words and figures, as JSON.
+//! Poses and health as JSON, with states in words.
 
 use nalgebra::Vector3;
 use semidense::service::health::{
@@ -11,13 +11,13 @@ use serde_json::{Value, json};
 use crate::ros::axes::place_covariance;
 use crate::session::Pose;
 
-/// A state, and in words why.
+/// A tracking state and its reason in words.
 pub fn state_words(state: TrackingState) -> (&'static str, &'static str) {
     match state {
         TrackingState::Initializing => {
             ("initializing", "no map yet: move the camera sideways, with texture in view")
         }
-        TrackingState::Tracking => ("tracking", "the pose is good to its covariance"),
+        TrackingState::Tracking => ("tracking", "the pose is accurate to its covariance"),
         TrackingState::Degraded(reason) => ("degraded", degraded_words(reason)),
         TrackingState::Lost(reason) => ("lost", lost_words(reason)),
     }
@@ -25,27 +25,27 @@ pub fn state_words(state: TrackingState) -> (&'static str, &'static str) {
 
 fn degraded_words(reason: DegradedReason) -> &'static str {
     match reason {
-        DegradedReason::Budget => "the deadline came before the finest level was solved",
+        DegradedReason::Budget => "the deadline passed before the finest level was solved",
         DegradedReason::LowOverlap => "few of the keyframe's points are in view",
         DegradedReason::HighResidual => {
             "the image differs from the keyframe by more than noise explains"
         }
         DegradedReason::Gap => "frames before this one are missing",
-        DegradedReason::Turning => "known depth is out of view: only the rotation is followed",
+        DegradedReason::Turning => "known depth is out of view: only the rotation is tracked",
     }
 }
 
 fn lost_words(reason: LostReason) -> &'static str {
     match reason {
-        LostReason::Diverged => "the alignment diverged: go back to what was seen before",
-        LostReason::TooFewInliers => "too few points match: go back to what was seen before",
+        LostReason::Diverged => "the alignment diverged: go back to where tracking worked",
+        LostReason::TooFewInliers => "too few points match: go back to where tracking worked",
         LostReason::NoPoints => "the keyframe has no usable points",
         LostReason::UnusableFrame => "the image has no contrast, or another size than the keyframe",
-        LostReason::MapRejected => "the map contradicts itself: a new one begins",
+        LostReason::MapRejected => "the map contradicts itself: a new one is started",
     }
 }
 
-/// A pose.
+/// A pose as JSON.
 pub fn pose_json(pose: &Pose) -> Value {
     let (message, estimate) = (&pose.message, &pose.estimate);
     let (state, reason) = state_words(estimate.state);
@@ -58,7 +58,7 @@ pub fn pose_json(pose: &Pose) -> Value {
         "code": message.state,
         "state": state,
         "reason": reason,
-        // Quaternion first, as it is sent; the page takes the translation first.
+        // Messages put the quaternion first; the page expects the translation first.
         "place": translation_first(&message.map_from_camera),
         "keyframe_from_camera": translation_first(&message.keyframe_from_camera),
         "covariance": position_covariance(&estimate.map_covariance, &estimate.map_from_camera.translation),
@@ -71,18 +71,18 @@ pub fn pose_json(pose: &Pose) -> Value {
     })
 }
 
-/// Translation, then quaternion.
+/// Reorders a pose to translation, then quaternion.
 fn translation_first([qx, qy, qz, qw, x, y, z]: &[f64; 7]) -> [f64; 7] {
     [*x, *y, *z, *qx, *qy, *qz, *qw]
 }
 
-/// Covariance xx, xy, xz, yy, yz, zz of the camera's position, of that of an increment from the left.
+/// Covariance xx, xy, xz, yy, yz, zz of the camera's position, from that of a left increment.
 fn position_covariance(upper: &[f64; 21], position: &Vector3<f64>) -> [f64; 6] {
     let of = place_covariance(position, upper);
     [of[(0, 0)], of[(0, 1)], of[(0, 2)], of[(1, 1)], of[(1, 2)], of[(2, 2)]]
 }
 
-/// What a process says of itself.
+/// A process's health report as JSON.
 pub fn health_json(process: &str, health: &HealthMessage) -> Value {
     let state = ProcessState::from_code(health.state).map_or("unknown", ProcessState::name);
     let times = |counts: &_| json!({ "p50": percentile_ms(counts, 0.5), "p99": percentile_ms(counts, 0.99), "max": percentile_ms(counts, 1.0) });
@@ -121,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_turn_about_the_origin_moves_a_distant_camera() {
+    fn a_rotation_about_the_origin_moves_a_distant_camera() {
         let mut upper = [0.0; 21];
         // Variance 1e-4 of the rotation about z: entry (5, 5), the last.
         upper[20] = 1e-4;

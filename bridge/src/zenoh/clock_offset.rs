@@ -1,57 +1,57 @@
-//! What the clock of another machine says in terms of ours.
+//! Estimates the offset between another machine's clock and ours.
 //!
-//! CLOCK_MONOTONIC counts from each machine's own start. The receiver asks the sender for its clock once a second; an answer
-//! bounds the difference by half of the time that the question took (Cristian, 1989), whether or not the clocks of the two
-//! machines are set. Until the first answer the difference follows from CLOCK_REALTIME, which is right as far as that is
-//! synchronised on both.
+//! CLOCK_MONOTONIC counts from each machine's own start. The receiver queries the sender's clock once a
+//! second; an answer determines the offset to within half of the round-trip time (Cristian, 1989), whether or
+//! not the clocks of the two machines are set. Until the first answer the offset follows from CLOCK_REALTIME,
+//! which is as accurate as its synchronisation on both machines.
 
 use std::collections::VecDeque;
 
-/// Answers that are compared: half a minute of them.
+/// Number of answers compared: half a minute of them.
 const KEPT: usize = 30;
-/// How far two quartz clocks may run apart, seconds a second.
+/// Upper limit for the relative drift of two quartz clocks, seconds per second.
 const MAX_DRIFT: f64 = 200e-6;
 
-/// A question for the other clock, and its answer.
+/// A query of the other clock and its answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ClockAnswer {
-    /// Our clock at the question.
+    /// Our clock at the query.
     pub asked_nanos: i64,
     /// The other clock at the answer.
     pub remote_nanos: i64,
-    /// Our clock when the answer came.
+    /// Our clock when the answer arrived.
     pub answered_nanos: i64,
 }
 
 impl ClockAnswer {
-    /// Ours − theirs, in the middle of the question's time.
+    /// Ours − theirs, at the middle of the round trip.
     fn offset_nanos(&self) -> i64 {
         let middle = self.asked_nanos.saturating_add(self.uncertainty_nanos());
         middle.saturating_sub(self.remote_nanos)
     }
 
-    /// How far that may be off.
+    /// Bound on the error of the offset.
     fn uncertainty_nanos(&self) -> i64 {
         self.answered_nanos.saturating_sub(self.asked_nanos) / 2
     }
 }
 
-/// The difference of two clocks.
+/// The offset between two clocks.
 #[derive(Debug, Clone, Default)]
 pub struct ClockOffset {
     answers: VecDeque<ClockAnswer>,
-    /// By CLOCK_REALTIME of both.
+    /// From CLOCK_REALTIME of both.
     by_realtime_nanos: i64,
 }
 
 impl ClockOffset {
-    /// Takes in CLOCK_REALTIME − CLOCK_MONOTONIC of both machines.
+    /// Sets CLOCK_REALTIME − CLOCK_MONOTONIC of both machines.
     pub fn tell_realtime(&mut self, remote_nanos: i64, local_nanos: i64) {
         self.by_realtime_nanos = remote_nanos.saturating_sub(local_nanos);
     }
 
-    /// Takes in an answer. One that contradicts those before tells that the other machine was suspended: its clock stood
-    /// still, and they count no more.
+    /// Adds an answer. One that contradicts the earlier ones shows that the other machine was suspended and
+    /// its clock stopped: the earlier ones are discarded.
     pub fn take(&mut self, answer: ClockAnswer) {
         if answer.answered_nanos < answer.asked_nanos {
             return;
@@ -71,18 +71,18 @@ impl ClockOffset {
         self.answers.push_back(answer);
     }
 
-    /// `remote_nanos` of the other clock in terms of ours.
+    /// Converts `remote_nanos` from the other clock to ours.
     pub fn local_nanos(&self, remote_nanos: i64) -> i64 {
         let offset = self.best().map_or(self.by_realtime_nanos, |best| best.offset_nanos());
         remote_nanos.saturating_add(offset)
     }
 
-    /// How far that may be off; `None` while it rests on CLOCK_REALTIME.
+    /// Bound on the error of the conversion; `None` while it relies on CLOCK_REALTIME.
     pub fn uncertainty_nanos(&self) -> Option<i64> {
         self.best().map(ClockAnswer::uncertainty_nanos)
     }
 
-    /// The answer that took the shortest time.
+    /// The answer with the shortest round trip.
     fn best(&self) -> Option<&ClockAnswer> {
         self.answers.iter().min_by_key(|answer| answer.uncertainty_nanos())
     }
@@ -94,14 +94,14 @@ mod tests {
 
     const MS: i64 = 1_000_000;
 
-    /// Theirs is ahead of ours by 100 s.
+    /// Their clock is ahead of ours by 100 s.
     fn answer(asked: i64, there: i64, back: i64) -> ClockAnswer {
         let remote_nanos = asked + there + 100_000 * MS;
         ClockAnswer { asked_nanos: asked, remote_nanos, answered_nanos: asked + there + back }
     }
 
     #[test]
-    fn the_shortest_question_counts() {
+    fn the_shortest_round_trip_counts() {
         let mut offset = ClockOffset::default();
         offset.take(answer(0, 40 * MS, 2 * MS));
         offset.take(answer(1000 * MS, MS, MS));
@@ -111,14 +111,14 @@ mod tests {
     }
 
     #[test]
-    fn before_an_answer_the_realtime_of_both_counts() {
+    fn before_the_first_answer_the_realtime_clocks_count() {
         let mut offset = ClockOffset::default();
         offset.tell_realtime(1_000, 5_000);
         assert_eq!((offset.local_nanos(10_000), offset.uncertainty_nanos()), (6_000, None));
     }
 
     #[test]
-    fn a_clock_that_stood_still_is_noticed_and_hostile_stamps_do_no_harm() {
+    fn a_stopped_clock_is_detected_and_arbitrary_stamps_are_accepted() {
         let mut offset = ClockOffset::default();
         offset.take(answer(0, MS, MS));
         let mut late = answer(1000 * MS, MS, MS);

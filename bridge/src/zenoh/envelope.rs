@@ -1,7 +1,7 @@
-//! What goes over the network: an envelope of 64 bytes, the message as it lies in shared memory, and its packed payload.
+//! The format on the network: an envelope of 64 bytes, the message as in shared memory, and its packed payload.
 //!
-//! Everything that arrives is taken for hostile: sizes, versions and codes are checked here, what the messages say where
-//! they are unpacked. Numbers are little-endian; a machine of the other order is refused by the first four bytes.
+//! Input is not trusted: sizes, versions and codes are checked here, the content of messages where they are
+//! unpacked. Numbers are little-endian; a machine of the other byte order is refused by the first four bytes.
 
 use semidense::wire::topic::WIRE_VERSION;
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
@@ -10,15 +10,15 @@ use crate::zenoh::kind::Kind;
 
 /// First four bytes, "SDZ1": format 1 of this envelope.
 const MAGIC: u32 = u32::from_le_bytes(*b"SDZ1");
-/// Most bytes of one message: the largest is the depth of a keyframe, 1.6 MB unpacked, or an image.
+/// Upper limit for the bytes of a message: the largest is the depth of a keyframe, 1.6 MB unpacked, or an image.
 pub const MAX_MESSAGE_BYTES: usize = 16 << 20;
 
 /// How a payload is packed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Packing {
-    /// As it is.
+    /// Unchanged.
     Plain,
-    /// LZ4 of columns.
+    /// Columns compressed with LZ4.
     Lz4,
     /// PNG.
     Png,
@@ -30,23 +30,23 @@ impl Packing {
     const ALL: [Self; 4] = [Self::Plain, Self::Lz4, Self::Png, Self::Jpeg];
 }
 
-/// The envelope.
+/// The envelope of a message.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, FromBytes, IntoBytes, Immutable, KnownLayout)]
 pub struct Envelope {
     /// Format of the envelope.
     pub magic: u32,
-    /// Wire version of the message: messages of another one are not looked at.
+    /// Wire version of the message: messages of another version are not decoded.
     pub wire_version: u32,
     /// Code of the [`Kind`].
     pub kind: u32,
-    /// Place of the [`Packing`] in the order of its declaration.
+    /// Index of the [`Packing`] in its declaration.
     pub packing: u32,
-    /// The sending program: drawn at random at its start.
+    /// Id of the sending program, drawn at random at its start.
     pub sender: u64,
-    /// Runs of the instance that the sender has seen: what came before belongs to another one.
+    /// Number of runs of the instance seen by the sender: earlier messages belong to another run.
     pub run: u64,
-    /// Counts the messages of this kind from 1.
+    /// Number of the message among those of its kind, from 1.
     pub number: u64,
     /// CLOCK_MONOTONIC of the sender when it was packed.
     pub sent_nanos: i64,
@@ -58,34 +58,34 @@ pub struct Envelope {
     pub payload_bytes: u32,
 }
 
-/// Why something that arrived is refused.
+/// Why received bytes are refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum EnvelopeError {
-    /// Not from this program.
-    #[error("{bytes} bytes are not a message of semidense")]
+    /// They are not from this program.
+    #[error("{bytes} bytes that are not a message of semidense")]
     Foreign {
-        /// How many came.
+        /// Number of bytes received.
         bytes: usize,
     },
-    /// Of another version.
-    #[error("the robot speaks wire version {found}, this program {WIRE_VERSION}")]
+    /// They are of another version.
+    #[error("the robot uses wire version {found}, this program {WIRE_VERSION}")]
     Version {
         /// Its version.
         found: u32,
     },
-    /// A code that stands for nothing, or a size that the message does not have.
-    #[error("an envelope with impossible codes or sizes")]
+    /// An unknown code, or an inconsistent size.
+    #[error("an envelope with invalid codes or sizes")]
     Broken,
 }
 
-/// A message as it arrived.
+/// A received message.
 #[derive(Debug, Clone, Copy)]
 pub struct Opened<'a> {
     /// Its envelope.
     pub envelope: Envelope,
-    /// What it is.
+    /// Its kind.
     pub kind: Kind,
-    /// How its payload is packed.
+    /// The packing of its payload.
     pub packing: Packing,
     /// Its fixed part.
     pub header: &'a [u8],
@@ -93,12 +93,12 @@ pub struct Opened<'a> {
     pub packed: &'a [u8],
 }
 
-/// What all messages of a sender have in common.
+/// The fields common to all messages of a sender.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Origin {
-    /// The sending program.
+    /// Id of the sending program.
     pub sender: u64,
-    /// Runs that it has seen.
+    /// Number of runs it has seen.
     pub run: u64,
     /// CLOCK_MONOTONIC now.
     pub sent_nanos: i64,
@@ -106,25 +106,25 @@ pub struct Origin {
     pub realtime_offset_nanos: i64,
 }
 
-/// A payload that is ready to be sent.
+/// A payload ready to be sent.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Packed {
-    /// How it is packed.
+    /// Its packing.
     pub packing: Packing,
-    /// Bytes before that.
+    /// Size before packing, bytes.
     pub unpacked_bytes: usize,
-    /// The bytes.
+    /// The packed bytes.
     pub bytes: Vec<u8>,
 }
 
 impl Packed {
-    /// No payload.
+    /// An empty payload.
     pub fn empty() -> Self {
         Self { packing: Packing::Plain, unpacked_bytes: 0, bytes: Vec::new() }
     }
 }
 
-/// The bytes of a message for the network.
+/// Assembles a message for the network.
 pub fn seal<T: IntoBytes + Immutable>(
     origin: &Origin,
     kind: Kind,
@@ -149,10 +149,10 @@ pub fn seal<T: IntoBytes + Immutable>(
     [envelope.as_bytes(), header, &payload.bytes].concat()
 }
 
-/// Checks what arrived, up to the bytes of its message.
+/// Checks received bytes, except for the content of the message.
 pub fn open(bytes: &[u8]) -> Result<Opened<'_>, EnvelopeError> {
     let foreign = EnvelopeError::Foreign { bytes: bytes.len() };
-    // What comes first tells the version, whatever follows.
+    // The first words contain the version, whatever follows.
     let ([magic, found], _) = <[u32; 2]>::read_from_prefix(bytes).map_err(|_| foreign)?;
     if magic != MAGIC {
         return Err(foreign);
@@ -173,7 +173,7 @@ pub fn open(bytes: &[u8]) -> Result<Opened<'_>, EnvelopeError> {
 }
 
 impl Opened<'_> {
-    /// Its fixed part, where it has the size of a `T`.
+    /// The fixed part, if it has the size of a `T`.
     pub fn message<T: FromBytes>(&self) -> Result<T, EnvelopeError> {
         T::read_from_bytes(self.header).map_err(|_| EnvelopeError::Broken)
     }
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_sealed_is_opened() {
+    fn a_sealed_message_can_be_opened() {
         let bytes = sealed();
         let opened = open(&bytes).unwrap();
         assert_eq!(
@@ -205,10 +205,10 @@ mod tests {
     }
 
     #[test]
-    fn another_version_is_refused_with_both() {
+    fn another_version_is_refused_with_both_numbers() {
         let mut bytes = sealed();
         bytes[4..8].copy_from_slice(&(WIRE_VERSION + 1).to_le_bytes());
-        // Whatever that version has behind its number.
+        // Whatever that version has after its number.
         bytes.truncate(12);
         let error = open(&bytes).unwrap_err().to_string();
         let both = [format!("version {},", WIRE_VERSION + 1), format!("program {WIRE_VERSION}")];
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn broken_ones_are_refused() {
+    fn malformed_messages_are_refused() {
         let whole = sealed();
         for length in 0..size_of::<Envelope>() + 16 {
             assert!(open(&whole[..length]).is_err(), "{length} bytes");

@@ -1,4 +1,4 @@
-//! The kinds of messages that go over the network: one for each topic, and the sender's presence.
+//! The kinds of messages on the network: one for each topic, and the sender's presence.
 
 use semidense::wire::topic::{
     ADJUSTMENT, CAPTURE_HEALTH, FRAME, GRAPH, KEYFRAME, KEYFRAME_IMAGE, MAPPER_HEALTH, POSE,
@@ -9,7 +9,7 @@ use zenoh::qos::Priority;
 /// First part of every key.
 pub const KEY_PREFIX: &str = "semidense";
 
-/// What a message is.
+/// The kind of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// `tracker/pose`.
@@ -30,12 +30,12 @@ pub enum Kind {
     Keyframe,
     /// `capture/frame`, as JPEG.
     Frame,
-    /// That the sender is there, its clock, and the newest message of each kind.
+    /// The sender's presence, its clock, and the number of the newest message of each kind.
     Presence,
 }
 
 impl Kind {
-    /// All of them, by code.
+    /// All kinds, by code.
     pub const ALL: [Self; 10] = [
         Self::Pose,
         Self::CaptureHealth,
@@ -48,27 +48,27 @@ impl Kind {
         Self::Frame,
         Self::Presence,
     ];
-    /// How many there are.
+    /// The number of kinds.
     pub const COUNT: usize = Self::ALL.len();
-    /// Health of each process, in the order of the pipeline.
+    /// Health of each process, in pipeline order.
     pub const HEALTH: [Self; 3] = [Self::CaptureHealth, Self::TrackerHealth, Self::MapperHealth];
 
-    /// Its code in an envelope.
+    /// The code of this kind in an envelope.
     pub fn code(self) -> u32 {
         self as u32
     }
 
-    /// The kind of a code; `None` for one that stands for nothing.
+    /// The kind with this code; `None` for an unknown code.
     pub fn from_code(code: u32) -> Option<Self> {
         Self::ALL.get(code as usize).copied()
     }
 
-    /// Health of the process with this name.
+    /// The health kind of the process with this name.
     pub fn of_health(owner: &str) -> Option<Self> {
         Self::HEALTH.into_iter().find(|kind| kind.topic().is_some_and(|t| t.owner == owner))
     }
 
-    /// The topic in shared memory; presence has none.
+    /// The topic in shared memory; `None` for presence.
     pub fn topic(self) -> Option<Topic> {
         Some(match self {
             Self::Pose => POSE,
@@ -84,8 +84,8 @@ impl Kind {
         })
     }
 
-    /// Key of this kind for `instance`: `semidense/INSTANCE/OWNER/NOUN`. The wire version is in the envelope, so that another
-    /// one is refused by name and not silently missed.
+    /// Key of this kind for `instance`: `semidense/INSTANCE/OWNER/NOUN`. The wire version is in the envelope,
+    /// so that another version is refused explicitly and not silently missed.
     pub fn key(self, instance: &str) -> String {
         match self.topic() {
             Some(topic) => format!("{KEY_PREFIX}/{instance}/{}/{}", topic.owner, topic.noun),
@@ -93,18 +93,18 @@ impl Kind {
         }
     }
 
-    /// Whether the last message is kept for receivers that come late or lost it.
+    /// Whether the last message is kept for receivers that start late or lost it.
     pub fn is_kept(self) -> bool {
         Self::HEALTH.contains(&self)
             || matches!(self, Self::Graph | Self::KeyframeImage | Self::Keyframe)
     }
 
-    /// Whether it goes out at once, on a thread that never packs large messages.
+    /// Whether it is sent at once, on a thread that never packs large messages.
     pub fn is_urgent(self) -> bool {
         self == Self::Pose || Self::HEALTH.contains(&self)
     }
 
-    /// Its priority on the network.
+    /// Priority of this kind on the network.
     pub fn priority(self) -> Priority {
         match self {
             Self::Pose | Self::Presence => Priority::RealTime,
@@ -123,7 +123,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn codes_and_keys_are_those_of_the_topics() {
+    fn codes_and_keys_match_the_topics() {
         for (code, kind) in Kind::ALL.into_iter().enumerate() {
             assert_eq!((kind.code() as usize, Kind::from_code(kind.code())), (code, Some(kind)));
         }

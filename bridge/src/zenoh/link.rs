@@ -1,4 +1,4 @@
-//! The Zenoh session: fixed links over TCP and nothing else. No scouting, no other ports, bounded buffers.
+//! The Zenoh session: fixed TCP links only. No scouting, no other ports, bounded buffers.
 
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -10,35 +10,34 @@ use crate::zenoh::envelope::MAX_MESSAGE_BYTES;
 use crate::zenoh::error::ZenohError;
 use crate::zenoh::kind::Kind;
 
-/// Port where none is named: Zenoh's own.
+/// Default port: Zenoh's own.
 const USUAL_PORT: u16 = 7447;
-/// Most links at a time: four receivers and room for those that reconnect before their old link is given up.
+/// Upper limit for concurrent links: four receivers, and room for reconnecting before an old link is closed.
 const MAX_LINKS: usize = 16;
-/// A link on which nothing comes for so long is given up and opened again, milliseconds: longer than the gaps that TCP
-/// bridges by itself.
+/// A link that is silent for longer is closed and reopened, milliseconds: longer than the gaps that TCP bridges.
 const LEASE_MS: u32 = 10_000;
 /// First and longest pause between two attempts to connect, milliseconds.
 const RETRY_MS: [u32; 2] = [250, 1000];
-/// Bytes that the kernel holds for sending, before it doubles them: what lies there is old when it arrives, and every pose
-/// waits behind it. On a link of 10 Mbit/s that is 0.1 s.
+/// Size of the kernel's send buffer before the kernel doubles it: data in it is old when it arrives, and
+/// delays every pose. On a link of 10 Mbit/s that is 0.1 s.
 const SEND_BUFFER_BYTES: u32 = 64 << 10;
 
-/// Batches that Zenoh holds for each priority, at most 16 of 64 kB: poses while its own threads wait for a busy CPU, and
-/// the depth of a keyframe in one piece.
+/// Batches that Zenoh holds for each priority, at most 16 of 64 kB: poses while its own threads wait for a
+/// busy CPU, and the depth of a keyframe in one piece.
 const BATCHES: &str = "{ control: 2, real_time: 16, interactive_high: 8, interactive_low: 2, data_high: 2, data: 4, \
                        data_low: 16, background: 8 }";
-/// How long a put waits for a place there before the message is dropped, and how long one of several batches, microseconds.
-/// Zenoh drops the newest, our own queues the oldest: while a put waits, those decide.
+/// How long a put of one batch, and of several, waits for a free batch before the message is dropped,
+/// microseconds. Zenoh drops the newest message, our own queues the oldest: while a put waits, ours decide.
 const PUT_WAITS_MICROS: [u32; 2] = [50_000, 200_000];
 
-/// Where to listen or to connect to: `tcp/HOST:PORT`.
+/// An address to listen on or to connect to: `tcp/HOST:PORT`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Endpoint {
     host: String,
     port: u16,
 }
 
-/// Why a text names no endpoint.
+/// Why a text is not an endpoint.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "`{0}` is not an endpoint: write tcp/HOST:PORT, as in tcp/192.168.1.7:7447 or tcp/[::1]:7447"
@@ -48,7 +47,7 @@ pub struct EndpointError(String);
 impl FromStr for Endpoint {
     type Err = EndpointError;
 
-    /// `tcp/HOST:PORT`; the protocol and the port may be left out.
+    /// Parses `tcp/HOST:PORT`; the protocol and the port may be omitted.
     fn from_str(text: &str) -> Result<Self, EndpointError> {
         let wrong = || EndpointError(text.to_owned());
         let address = match text.split_once('/') {
@@ -57,7 +56,7 @@ impl FromStr for Endpoint {
             None => text,
         };
         let (host, port) = match address.rsplit_once(':') {
-            // Of an address of IPv6 only what follows the bracket is a port.
+            // In an IPv6 address, only what follows the bracket is a port.
             Some((host, port)) if !port.ends_with(']') => {
                 (host, port.parse().map_err(|_| wrong())?)
             }
@@ -82,25 +81,25 @@ impl std::fmt::Display for Endpoint {
 }
 
 impl Endpoint {
-    /// Whether only programs of this machine reach it.
+    /// Whether it can be reached from this machine only.
     pub fn is_local(&self) -> bool {
         let is_v4 = self.host.parse::<std::net::Ipv4Addr>().is_ok_and(|a| a.is_loopback());
         is_v4 || self.host == "localhost" || self.host == "[::1]"
     }
 }
 
-/// Where to listen and where to connect to; the texts are those of the command line.
+/// Addresses to listen on and to connect to; the texts are those of the command line.
 #[derive(Debug, Clone, Default, PartialEq, Eq, clap::Args)]
 pub struct Endpoints {
-    /// Open a port for the other side: tcp/HOST:PORT, beyond this machine only where HOST says so (tcp/0.0.0.0:7447);
-    /// may be repeated
+    /// Open a port for the other side: tcp/HOST:PORT, reachable from other machines only if HOST says so
+    /// (tcp/0.0.0.0:7447); may be repeated
     #[arg(long, value_name = "ENDPOINT")]
     pub listen: Vec<Endpoint>,
-    /// Connect to a port of the other side, tcp/HOST:PORT, again and again until it answers; may be repeated
+    /// Connect to a port of the other side, tcp/HOST:PORT, retrying until it answers; may be repeated
     #[arg(long, value_name = "ENDPOINT")]
     pub connect: Vec<Endpoint>,
-    /// File with one line `user:password` for both sides (mode 0600): who does not know it is refused. It does not
-    /// encrypt
+    /// File with one line `user:password` for both sides (mode 0600): a peer with other credentials is
+    /// refused. The link is not encrypted
     #[arg(long, value_name = "FILE")]
     pub password_file: Option<PathBuf>,
 }
@@ -113,7 +112,7 @@ impl std::fmt::Display for Endpoints {
     }
 }
 
-/// Opens the session. Endpoints that do not answer are tried again and again, in the background.
+/// Opens the session. Endpoints that do not answer are retried in the background.
 pub fn open(endpoints: &Endpoints) -> Result<Session, ZenohError> {
     let config = config(endpoints)?;
     zenoh::open(config).wait().map_err(|error| {
@@ -122,13 +121,13 @@ pub fn open(endpoints: &Endpoints) -> Result<Session, ZenohError> {
     })
 }
 
-/// Bits of the random name of a session's program.
+/// Bits of the session's random id.
 pub fn sender_id(session: &Session) -> u64 {
     let bytes = session.zid().to_le_bytes();
     bytes.iter().take(size_of::<u64>()).rev().fold(0, |id, byte| id << 8 | u64::from(*byte))
 }
 
-/// The publisher of `kind` for `instance`. What the network does not take at once is dropped, never waited for.
+/// Declares the publisher of `kind` for `instance`. Messages that the network does not accept are dropped.
 pub fn publisher(
     session: &Session,
     instance: &str,
@@ -144,9 +143,9 @@ pub fn publisher(
         .map_err(|error| declare_error(&key, &error))
 }
 
-/// The error of a declaration.
+/// The error of a failed declaration.
 pub fn declare_error(key: &str, error: &dyn std::fmt::Display) -> ZenohError {
-    ZenohError::Link(format!("Zenoh does not declare {key}: {}", first_line(error)))
+    ZenohError::Link(format!("Zenoh cannot declare {key}: {}", first_line(error)))
 }
 
 fn config(endpoints: &Endpoints) -> Result<Config, ZenohError> {
@@ -160,7 +159,7 @@ fn config(endpoints: &Endpoints) -> Result<Config, ZenohError> {
     );
     let mut keys: Vec<(&'static str, String)> = vec![
         ("mode", "\"peer\"".into()),
-        // Said even where it is empty: the default opens a port on all addresses.
+        // Set even if empty: the default opens a port on all addresses.
         ("listen/endpoints", list(&endpoints.listen)),
         ("connect/endpoints", list(&endpoints.connect)),
         ("connect/timeout_ms", "-1".into()),
@@ -196,13 +195,13 @@ fn config(endpoints: &Endpoints) -> Result<Config, ZenohError> {
         config.insert_json5(key, &value).map_err(|error| {
             let shown = if key.ends_with("password") { "…" } else { &value };
             let reason = first_line(&error);
-            ZenohError::Link(format!("Zenoh does not take {key} = {shown}: {reason}"))
+            ZenohError::Link(format!("Zenoh rejects {key} = {shown}: {reason}"))
         })?;
     }
     Ok(config)
 }
 
-/// User and password of a file that nobody else can read.
+/// Reads user and password from a file that only its owner can read.
 fn read_password(path: &Path) -> Result<(String, String), ZenohError> {
     use std::os::unix::fs::PermissionsExt;
     /// Permissions of the group and of all others.
@@ -210,7 +209,7 @@ fn read_password(path: &Path) -> Result<(String, String), ZenohError> {
     let wrong = |reason: &str| {
         let path = path.display();
         ZenohError::Link(format!(
-            "{path}: {reason}; the file has one line `user:password` and is read by its owner alone (chmod 600)"
+            "{path}: {reason}; the file must have one line `user:password` and be readable by its owner only (chmod 600)"
         ))
     };
     let found = std::fs::metadata(path).map_err(|error| wrong(&error.to_string()))?;
@@ -228,7 +227,7 @@ fn read_password(path: &Path) -> Result<(String, String), ZenohError> {
     }
 }
 
-/// Zenoh's errors name their place in its source behind the reason.
+/// Removes the source location that Zenoh appends to the reason of an error.
 fn first_line(error: &dyn std::fmt::Display) -> String {
     let text = error.to_string();
     let line = text.lines().next().unwrap_or_default();
@@ -240,7 +239,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn endpoints_are_read() {
+    fn endpoints_are_parsed() {
         let name = |text: &str| text.parse::<Endpoint>().map(|e| e.to_string());
         for (text, endpoint) in [
             ("robot", "tcp/robot:7447"),
@@ -268,14 +267,14 @@ mod tests {
     }
 
     #[test]
-    fn local_ones_are_known() {
+    fn local_endpoints_are_recognised() {
         let is_local = |text: &str| text.parse::<Endpoint>().unwrap().is_local();
         assert!(is_local("127.0.0.1") && is_local("localhost:1") && is_local("[::1]:7"));
         assert!(!is_local("0.0.0.0") && !is_local("[::]:7") && !is_local("robot"));
     }
 
     #[test]
-    fn zenoh_takes_the_configuration() {
+    fn zenoh_accepts_the_configuration() {
         let endpoints = Endpoints {
             listen: vec!["127.0.0.1:1".parse().unwrap()],
             connect: vec!["robot".parse().unwrap()],

@@ -1,7 +1,7 @@
-//! The instance at the receiving end: the topics of the robot in shared memory, under a name of this machine.
+//! The instance at the receiving end: the robot's topics in shared memory, under an instance name of this machine.
 //!
-//! The names of its processes are claimed, so that neither a second receiver nor a pipeline of this machine can speak on the
-//! same topics.
+//! The names of its processes are claimed, so that neither a second receiver nor a pipeline of this machine
+//! can publish on the same topics.
 
 use semidense::service::clock::now_nanos;
 use semidense::service::health::ProcessState;
@@ -22,18 +22,18 @@ use crate::zenoh::error::ZenohError;
 use crate::zenoh::kind::Kind;
 use crate::zenoh::unpack::Arrival;
 
-/// Time between two reports of a silence, nanoseconds: as often as processes report.
+/// Period of reports during a silence, nanoseconds: that of the processes' reports.
 const REPORT_PERIOD_NANOS: i64 = 1_000_000_000;
-/// What the supervisor of a run claims.
+/// Name that the supervisor of a run claims.
 const SUPERVISOR: &str = "supervisor";
 
-/// The topics of one instance.
+/// The topics of the mirrored instance.
 pub struct Mirror {
     poses: Publisher<PoseMessage, ()>,
     adjustments: Publisher<AdjustmentMessage, ()>,
     graphs: Publisher<KeyframePoseMessage, GraphHeader>,
     keyframes: Publisher<DepthPoint, KeyframeHeader>,
-    /// With the pixels that they have room for.
+    /// Publishers with their capacity in pixels.
     images: (usize, Publisher<u8, KeyframeImageHeader>),
     frames: (usize, Publisher<u8, FrameHeader>),
     health: [Reported; 3],
@@ -44,9 +44,9 @@ pub struct Mirror {
 /// The health of one process.
 struct Reported {
     publisher: Publisher<HealthMessage, ()>,
-    /// As it came, with stamps of this machine.
+    /// The last report, with stamps of this machine.
     last: HealthMessage,
-    /// CLOCK_MONOTONIC when it was published here.
+    /// CLOCK_MONOTONIC of its publication here.
     told_nanos: i64,
     is_silent: bool,
 }
@@ -72,7 +72,7 @@ impl Mirror {
             adjustments: hub.publisher(&ADJUSTMENT, 1)?,
             graphs: hub.publisher(&GRAPH, MAX_GRAPH_KEYFRAMES)?,
             keyframes: hub.publisher(&KEYFRAME, MAX_KEYFRAME_POINTS)?,
-            // The topics are there for subscribers at once; their size is known with the first image.
+            // Subscribers find the topics at once; their size is known with the first image.
             images: (1, hub.publisher(&KEYFRAME_IMAGE, 1)?),
             frames: (1, hub.publisher(&FRAME, 1)?),
             health: [reported(0)?, reported(1)?, reported(2)?],
@@ -83,7 +83,7 @@ impl Mirror {
         Ok(mirror)
     }
 
-    /// Publishes what arrived; its stamps are those of this machine already.
+    /// Publishes an arrival, whose stamps are already those of this machine.
     pub fn publish(&mut self, arrival: &Arrival) -> Result<(), ZenohError> {
         match arrival {
             Arrival::Pose(message) => self.poses.send((), &[**message])?,
@@ -111,7 +111,7 @@ impl Mirror {
         Ok(())
     }
 
-    /// Gives the last keyframe, graph, pose and health to subscribers that came late.
+    /// Sends the last keyframe, graph, pose and health to late subscribers.
     pub fn serve_late_joiners(&self) {
         self.poses.serve_late_joiners();
         self.adjustments.serve_late_joiners();
@@ -122,7 +122,7 @@ impl Mirror {
         self.health.iter().for_each(|reported| reported.publisher.serve_late_joiners());
     }
 
-    /// Says once a second why nothing comes: health becomes stale and does not just stop. What has finished stays so.
+    /// Reports the cause of a silence once a second, as stale health. A finished process stays finished.
     pub fn tell_silence(&mut self, cause: &str) -> Result<(), ZenohError> {
         let now = now_nanos();
         for reported in &mut self.health {
@@ -148,7 +148,7 @@ impl Mirror {
         Ok(())
     }
 
-    /// The process id is this program's: the robot's means nothing to who looks here whether it is alive.
+    /// Publishes health with this program's process id: the robot's means nothing to liveness checks on this machine.
     fn publish_health(&mut self, kind: Kind, message: &HealthMessage) -> Result<(), ZenohError> {
         let place = Kind::HEALTH.iter().position(|of| *of == kind);
         let Some(reported) = place.and_then(|place| self.health.get_mut(place)) else {

@@ -1,4 +1,4 @@
-//! What the sender's threads share: numbers, the run, and the last message of each kind for receivers that come late.
+//! State shared by the sender's threads: numbers, the run, and the last message of each kind for late receivers.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -10,7 +10,7 @@ use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 use crate::zenoh::envelope::{Origin, Packed, seal};
 use crate::zenoh::kind::Kind;
 
-/// Says that the sender is there. Its envelope carries the sender's clock.
+/// Announces that the sender is running. Its envelope carries the sender's clock.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, FromBytes, IntoBytes, Immutable, KnownLayout)]
 pub struct Presence {
@@ -20,7 +20,7 @@ pub struct Presence {
     pub newest: [u64; Kind::COUNT],
 }
 
-/// Numbers and keeps what is sent.
+/// Numbers outgoing messages and keeps the last ones.
 #[derive(Debug)]
 pub struct Outlet {
     sender: u64,
@@ -32,7 +32,7 @@ pub struct Outlet {
 }
 
 impl Outlet {
-    /// Nothing sent yet.
+    /// An outlet that has sent nothing yet.
     pub fn new(sender: u64) -> Self {
         Self {
             sender,
@@ -44,19 +44,19 @@ impl Outlet {
         }
     }
 
-    /// An instance was joined.
+    /// Marks that an instance was joined.
     pub fn begin_run(&self) {
         self.run.fetch_add(1, Ordering::AcqRel);
         *self.kept() = Default::default();
         self.is_joined.store(true, Ordering::Release);
     }
 
-    /// The instance is gone. What it said last stays for receivers that come late.
+    /// Marks that the instance has gone. Its last messages stay for late receivers.
     pub fn end_run(&self) {
         self.is_joined.store(false, Ordering::Release);
     }
 
-    /// The bytes of a message; of the kinds that are kept it is the last from now on.
+    /// Assembles a message; if its kind is kept, it becomes the last one.
     pub fn seal<T: IntoBytes + Immutable>(
         &self,
         kind: Kind,
@@ -73,7 +73,7 @@ impl Outlet {
         sealed
     }
 
-    /// Runs that were seen.
+    /// Number of runs seen.
     pub fn run(&self) -> u64 {
         self.run.load(Ordering::Acquire)
     }
@@ -83,7 +83,7 @@ impl Outlet {
         self.kept()[kind as usize].clone()
     }
 
-    /// The answer to who asks whether the sender is there.
+    /// The answer to a query for presence.
     pub fn presence(&self) -> ZBytes {
         let presence = Presence {
             is_joined: u64::from(self.is_joined.load(Ordering::Acquire)),

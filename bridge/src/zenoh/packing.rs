@@ -1,7 +1,7 @@
-//! Payloads made small for the network, without loss but for frames: points by columns and LZ4, images as PNG.
+//! Compresses payloads for the network, losslessly except for frames: points by columns and LZ4, images as PNG.
 //!
-//! Points lie row by row in the image, so that differences of u and v are nearly all small; the bytes of equal rank of the
-//! real numbers stand together, because exponents repeat and mantissas do not.
+//! Points are ordered row by row, so that differences of u and v are nearly all small; the bytes of equal
+//! significance of the real numbers are stored together, because exponents repeat and mantissas do not.
 
 use std::io::Cursor;
 
@@ -14,17 +14,17 @@ use crate::zenoh::envelope::{Opened, Packed, Packing};
 /// Bytes of a point.
 const POINT_BYTES: usize = size_of::<DepthPoint>();
 
-/// A payload that is not what its envelope says.
+/// A payload that does not match its envelope.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("a payload that does not unpack to what is announced")]
+#[error("a payload that does not unpack to the announced size")]
 pub struct UnpackError;
 
-/// Fixed-size elements as they are: graphs.
+/// Packs fixed-size elements unchanged, for graphs.
 pub fn pack_plain(bytes: &[u8]) -> Packed {
     Packed { packing: Packing::Plain, unpacked_bytes: bytes.len(), bytes: bytes.to_vec() }
 }
 
-/// Depth of a keyframe.
+/// Packs the depth of a keyframe.
 pub fn pack_points(points: &[DepthPoint]) -> Packed {
     let mut planes = vec![0; points.len() * POINT_BYTES];
     let mut before = [0; 2];
@@ -39,7 +39,7 @@ pub fn pack_points(points: &[DepthPoint]) -> Packed {
     lz4(&planes)
 }
 
-/// Depth of a keyframe, as it was.
+/// Unpacks the depth of a keyframe, bit for bit.
 pub fn unpack_points(opened: &Opened<'_>) -> Result<Vec<DepthPoint>, UnpackError> {
     let bytes = opened.envelope.payload_bytes as usize;
     let count = bytes / POINT_BYTES;
@@ -59,13 +59,13 @@ pub fn unpack_points(opened: &Opened<'_>) -> Result<Vec<DepthPoint>, UnpackError
     Ok(points)
 }
 
-/// A grey image of `width` × `height` pixels.
+/// Packs a grey image of `width` × `height` pixels.
 pub fn pack_image(pixels: &[u8], width: u32, height: u32) -> Result<Packed, CompressError> {
     let bytes = png(width, height, pixels)?;
     Ok(Packed { packing: Packing::Png, unpacked_bytes: pixels.len(), bytes })
 }
 
-/// A grey image of `width` × `height` pixels, as it was; nothing is unpacked that has another size.
+/// Unpacks a grey image of `width` × `height` pixels, bit for bit; one of another size is refused before unpacking.
 pub fn unpack_image(opened: &Opened<'_>, width: u32, height: u32) -> Result<Vec<u8>, UnpackError> {
     let length = width as usize * height as usize;
     if opened.packing != Packing::Png || opened.envelope.payload_bytes as usize != length {
@@ -84,13 +84,13 @@ pub fn unpack_image(opened: &Opened<'_>, width: u32, height: u32) -> Result<Vec<
     Ok(pixels)
 }
 
-/// Packs with LZ4.
+/// Compresses with LZ4.
 fn lz4(bytes: &[u8]) -> Packed {
     let packed = lz4_flex::block::compress(bytes);
     Packed { packing: Packing::Lz4, unpacked_bytes: bytes.len(), bytes: packed }
 }
 
-/// Exactly `length` bytes; never more, whatever is packed.
+/// Decompresses exactly `length` bytes, never more, whatever the input.
 fn unlz4(opened: &Opened<'_>, length: usize) -> Result<Vec<u8>, UnpackError> {
     if opened.packing != Packing::Lz4 || opened.envelope.payload_bytes as usize != length {
         return Err(UnpackError);
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn every_bit_comes_back() {
+    fn packing_preserves_every_bit() {
         for count in [0, 1, 1000] {
             let points = points(count);
             let bytes = sealed(&pack_points(&points));
@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_payloads_are_refused() {
+    fn malformed_payloads_are_refused() {
         let good = pack_points(&points(100));
         let cut = Packed { bytes: good.bytes[..good.bytes.len() / 2].to_vec(), ..good.clone() };
         let more = Packed { unpacked_bytes: good.unpacked_bytes + POINT_BYTES, ..good.clone() };

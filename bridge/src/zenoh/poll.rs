@@ -1,5 +1,5 @@
-//! Asks the sender once a second whether it is there: that gives its clock, and tells what was missed. What is kept there
-//! and missing here (a late start, a cut link, a dropped message) is fetched.
+//! Queries the sender's presence once a second, which gives its clock and reveals missed messages. Messages
+//! that it keeps and that are missing here (a late start, a cut link, a drop) are fetched.
 
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
@@ -15,21 +15,21 @@ use crate::zenoh::kind::Kind;
 use crate::zenoh::shared::Shared;
 use crate::zenoh::unpack::{Arrival, unpack};
 
-/// Time between two questions.
+/// Time between two queries.
 const PERIOD: Duration = Duration::from_secs(1);
 /// The same until the first answer.
 const FIRST_PERIOD: Duration = Duration::from_millis(200);
-/// Longest wait for an answer.
+/// Upper limit for the wait for an answer.
 const LONGEST_ANSWER: Duration = Duration::from_secs(2);
 
-/// Asks until the other end of `stop` is gone.
+/// Queries until the other end of `stop` is dropped.
 pub fn poll(network: &Session, instance: &str, shared: &Shared, stop: &Receiver<()>) {
     let mut period = FIRST_PERIOD;
     let mut missing_before = Vec::new();
     loop {
         let missing = ask(network, instance, shared);
         if let Some(missing) = missing {
-            // Twice in a row: what is only on its way needs no second copy. At the start nothing is on its way.
+            // Missing twice in a row: a message in transit needs no second copy. At the start nothing is in transit.
             let is_first = period == FIRST_PERIOD;
             let fetched = missing.iter().filter(|kind| is_first || missing_before.contains(*kind));
             fetched.for_each(|kind| fetch(network, instance, shared, *kind));
@@ -42,7 +42,7 @@ pub fn poll(network: &Session, instance: &str, shared: &Shared, stop: &Receiver<
     }
 }
 
-/// One question; the kinds that are missing, `None` where nobody answers.
+/// Sends one query; returns the missing kinds, or `None` without an answer.
 fn ask(network: &Session, instance: &str, shared: &Shared) -> Option<Vec<Kind>> {
     let asked_nanos = now_nanos();
     let mut missing = None;
@@ -62,7 +62,7 @@ fn ask(network: &Session, instance: &str, shared: &Shared) -> Option<Vec<Kind>> 
     missing
 }
 
-/// The last message of a kind.
+/// Fetches the last message of a kind.
 fn fetch(network: &Session, instance: &str, shared: &Shared, kind: Kind) {
     get(network, &kind.key(instance), Priority::DataLow, |bytes| {
         shared.arrive(kind, bytes.clone())
@@ -72,7 +72,7 @@ fn fetch(network: &Session, instance: &str, shared: &Shared, kind: Kind) {
 fn get(network: &Session, key: &str, priority: Priority, mut take: impl FnMut(&ZBytes)) {
     let asked = network
         .get(key)
-        // All answers, as they come: two robots with one name must be seen.
+        // Every answer as it arrives: two robots with one name must be detected.
         .target(QueryTarget::All)
         .consolidation(ConsolidationMode::None)
         .congestion_control(CongestionControl::Drop)

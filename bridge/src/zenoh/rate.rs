@@ -1,11 +1,11 @@
-//! How often something is sent: at most so many a second, the newest of what came meanwhile.
+//! Rate limits that let through the newest item.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use semidense::slam::keyframe::Keyframe;
 
-/// Lets through at most so many a second.
+/// Lets through a limited number of items per second.
 #[derive(Debug)]
 pub struct Rate {
     period: Duration,
@@ -13,27 +13,27 @@ pub struct Rate {
 }
 
 impl Rate {
-    /// At most `rate_hz` a second; a rate that is not positive lets one through a minute.
+    /// At most `rate_hz` per second; a rate that is not positive lets one through per minute.
     pub fn new(rate_hz: f64) -> Self {
         const LONGEST: Duration = Duration::from_secs(60);
         let period = Duration::try_from_secs_f64(1.0 / rate_hz).unwrap_or(LONGEST).min(LONGEST);
         Self { period, due: None }
     }
 
-    /// Whether one may go now; it counts as gone.
+    /// Whether an item may be sent now; if so, it counts as sent.
     pub fn is_due(&mut self, now: Instant) -> bool {
         let due = self.due.unwrap_or(now);
         if now < due {
             return false;
         }
-        // On the grid of the rate where that is kept, so that 15 of 30 frames go and not 10.
+        // On the grid of the rate if that is kept, so that 15 of 30 frames are sent and not 10.
         let next = due + self.period;
         self.due = Some(if next > now { next } else { now + self.period });
         true
     }
 }
 
-/// The newest revision of the active keyframe.
+/// Limits the rate of revisions of the active keyframe.
 #[derive(Debug)]
 pub struct Latest {
     rate: Rate,
@@ -42,17 +42,17 @@ pub struct Latest {
 }
 
 impl Latest {
-    /// At most `rate_hz` revisions a second.
+    /// At most `rate_hz` revisions per second.
     pub fn new(rate_hz: f64) -> Self {
         Self { rate: Rate::new(rate_hz), sent: None, waiting: None }
     }
 
-    /// Takes in a revision.
+    /// Replaces the pending revision.
     pub fn take(&mut self, keyframe: Arc<Keyframe>) {
         self.waiting = Some(keyframe);
     }
 
-    /// What is to be sent now: another keyframe at once, a revision when it is due.
+    /// The keyframe to send now: another one at once, a revision when it is due.
     pub fn due(&mut self, now: Instant) -> Option<Arc<Keyframe>> {
         let id = self.waiting.as_ref().map(|k| (k.epoch, k.keyframe_id))?;
         if self.sent != Some(id) {
@@ -65,7 +65,7 @@ impl Latest {
         self.waiting.take()
     }
 
-    /// The run is over.
+    /// Forgets the keyframe at the end of a run.
     pub fn forget(&mut self) {
         (self.sent, self.waiting) = (None, None);
     }
@@ -76,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_rate_is_kept() {
+    fn the_rate_is_not_exceeded() {
         let start = Instant::now();
         let count = |rate_hz: f64| {
             let mut rate = Rate::new(rate_hz);

@@ -1,7 +1,7 @@
-//! Receiving: takes the messages of one robot from Zenoh and publishes them in the shared memory of this machine.
+//! Receives one robot's messages from Zenoh and publishes them in the shared memory of this machine.
 //!
-//! Zenoh's threads only put into queues in which the newest wins; one thread unpacks what is large, one asks the sender
-//! whether it is there, and the main one publishes: a pose never waits for an image.
+//! Zenoh's threads only put into queues in which the newest wins; one thread unpacks large messages, one
+//! queries the sender's presence, and the main thread publishes: a pose never waits for an image.
 
 use std::io::Read;
 use std::os::fd::AsFd;
@@ -23,14 +23,14 @@ use crate::zenoh::mirror::Mirror;
 use crate::zenoh::poll::poll;
 use crate::zenoh::shared::Shared;
 
-/// Longest wait for a message without a look at the silence and at subscribers that came late.
+/// Upper limit for a wait for messages before silence and late subscribers are checked.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
 
-/// Time between two lines of the log.
+/// Time between two log lines.
 const TELL_PERIOD: Duration = Duration::from_secs(10);
 
-/// Receives the instance `from` of the robot until the signal, and publishes as the instance at `place`. Waits for a robot
-/// that is not there yet.
+/// Receives the instance `from` of the robot until a signal arrives, and publishes it as the instance at
+/// `place`. Waits for a robot that is not reachable yet.
 pub fn receive(
     place: &Place,
     endpoints: &Endpoints,
@@ -60,7 +60,7 @@ pub fn receive(
         drop(running);
         outcome
     });
-    // What cannot be told any more is noticed by the other side's lease.
+    // If this cannot be sent, the other side notices by its lease.
     let _ = network.close().wait();
     outcome
 }
@@ -110,7 +110,7 @@ fn publish(
     Ok(())
 }
 
-/// What was missed, for the log.
+/// Logs what was lost.
 fn tell(shared: &Shared) {
     let remote = shared.remote();
     let lost: Vec<String> = Kind::ALL
@@ -119,7 +119,7 @@ fn tell(shared: &Shared) {
         .map(|kind| format!("{kind:?} {}", remote.lost(kind)))
         .collect();
     let clock = remote.clock.uncertainty_nanos();
-    let clock = clock.map_or("by CLOCK_REALTIME".to_owned(), |nanos| {
+    let clock = clock.map_or("taken from CLOCK_REALTIME".to_owned(), |nanos| {
         format!("known to {:.1} ms", nanos as f64 * 1e-6)
     });
     tracing::info!(

@@ -1,4 +1,4 @@
-//! What the receiver knows of the sender: which program speaks, what came and is missing, its clock, and when it was heard.
+//! The receiver's view of the sender: its program, its clock, received and missing messages, time last heard.
 
 use std::time::{Duration, Instant};
 
@@ -9,32 +9,32 @@ use crate::zenoh::envelope::Envelope;
 use crate::zenoh::kind::Kind;
 use crate::zenoh::outlet::{Presence, realtime_offset_nanos};
 
-/// A sender that was not heard for so long gives way to another one under its name: it asks for presence once a second.
+/// A sender that is silent for longer gives way to another program with its name: presence is queried once a second.
 const GIVES_WAY: Duration = Duration::from_millis(1500);
-/// Silence after which health says that the link is gone: processes report once a second.
+/// Silence after which health reports the link as down: processes report once a second.
 const LONGEST_SILENCE: Duration = Duration::from_secs(3);
 
-/// What is known of the sender.
+/// State of the sender.
 #[derive(Debug, Default)]
 pub struct Remote {
-    /// Translates its stamps.
+    /// Converts its stamps.
     pub clock: ClockOffset,
-    /// Messages that were refused because they are broken.
+    /// Number of refused malformed messages.
     pub refused: u64,
     sender: Option<u64>,
     run: u64,
     heard: Option<Instant>,
     is_joined: Option<bool>,
-    /// Another wire version that was heard, and when.
+    /// Another wire version that was received, and when.
     foreign: Option<(u32, Instant)>,
-    /// When another program spoke under the same name.
+    /// When another program last sent under the same name.
     rival: Option<Instant>,
     received: [u64; Kind::COUNT],
     lost: [u64; Kind::COUNT],
 }
 
 impl Remote {
-    /// Whether a message is to be used: of the program that is listened to, of its present run, and new.
+    /// Whether a message is to be used: from the current sender and run, and new.
     pub fn admit(&mut self, envelope: &Envelope, kind: Kind, now: Instant) -> bool {
         if !self.hear(envelope, now) || envelope.run < self.run {
             return false;
@@ -51,7 +51,7 @@ impl Remote {
         true
     }
 
-    /// Takes in an answer to the question for presence; the kinds that are kept there and missing here.
+    /// Processes an answer about presence; returns the kinds kept there and missing here.
     pub fn answer(
         &mut self,
         envelope: &Envelope,
@@ -69,51 +69,53 @@ impl Remote {
         Kind::ALL.into_iter().filter(|kind| kind.is_kept()).filter(is_missing).collect()
     }
 
-    /// Takes in that something of another version came.
+    /// Records a message of another wire version.
     pub fn hear_foreign(&mut self, version: u32, now: Instant) {
         if self.foreign.is_none_or(|(known, _)| known != version) {
             tracing::warn!(
-                "the robot speaks wire version {version}, this program {WIRE_VERSION}: install the same version of semidense-bridge on both"
+                "the robot uses wire version {version}, this program {WIRE_VERSION}: install the same version of semidense-bridge on both"
             );
         }
         self.foreign = Some((version, now));
     }
 
-    /// Why what is known is old; `None` while the sender and its instance are there.
+    /// Why the state is outdated; `None` while the sender and its instance are running.
     pub fn silence(&self, instance: &str, endpoints: &str, now: Instant) -> Option<String> {
         let is_recent = |heard: &Instant| now.saturating_duration_since(*heard) <= LONGEST_SILENCE;
         if self.heard.as_ref().is_none_or(|heard| !is_recent(heard)) {
             let foreign = self.foreign.as_ref().filter(|(_, heard)| is_recent(heard));
             return Some(match foreign {
                 Some((version, _)) => format!(
-                    "the robot speaks wire version {version}, this program {WIRE_VERSION}: install the same version on both"
+                    "the robot uses wire version {version}, this program {WIRE_VERSION}: install the same version on both"
                 ),
                 None => format!(
-                    "no word of `{instance}` from {endpoints}: the link is down, or `semidense zenoh send` does not run there"
+                    "no messages of `{instance}` from {endpoints}: the link is down, or `semidense zenoh send` is not running there"
                 ),
             });
         }
         if self.is_joined == Some(false) {
-            return Some(format!("the robot is there, but its instance `{instance}` does not run"));
+            return Some(format!(
+                "the robot is reachable, but its instance `{instance}` is not running"
+            ));
         }
         self.rival.as_ref().filter(|heard| is_recent(heard)).map(|_| {
-            format!("two programs send as `{instance}`: give each robot a name of its own (--instance there, --from here)")
+            format!("two programs send as `{instance}`: give each robot its own name (--instance there, --from here)")
         })
     }
 
-    /// Messages of a kind that did not arrive.
+    /// Number of messages of a kind that did not arrive.
     pub fn lost(&self, kind: Kind) -> u64 {
         self.lost[kind as usize]
     }
 
-    /// Whether the envelope is of the program that is listened to; the first one is, and the next when that is gone.
+    /// Whether the envelope is from the current sender: the first one heard, or its successor once it has gone.
     fn hear(&mut self, envelope: &Envelope, now: Instant) -> bool {
         if self.sender != Some(envelope.sender) {
             let is_alive =
                 self.heard.is_some_and(|heard| now.saturating_duration_since(heard) < GIVES_WAY);
             if self.sender.is_some() && is_alive {
                 if self.rival.is_none() {
-                    tracing::warn!("two programs send under the same name; one is listened to");
+                    tracing::warn!("two programs send under the same name; only one is used");
                 }
                 self.rival = Some(now);
                 return false;
@@ -125,7 +127,7 @@ impl Remote {
         true
     }
 
-    /// Another program: its numbers and its clock are new.
+    /// Starts over with another sender, whose numbers and clock are new.
     fn begin(&mut self, sender: u64) {
         self.sender = Some(sender);
         (self.run, self.is_joined) = (0, None);
@@ -147,7 +149,7 @@ mod tests {
     const ANSWER: ClockAnswer = ClockAnswer { asked_nanos: 0, remote_nanos: 0, answered_nanos: 1 };
 
     #[test]
-    fn a_message_is_used_once_and_what_is_missing_is_counted() {
+    fn a_message_is_used_once_and_lost_ones_are_counted() {
         let (mut remote, now) = (Remote::default(), Instant::now());
         let mut admit = |run, number| remote.admit(&envelope(1, run, number), Kind::Pose, now);
         assert!(admit(1, 5) && admit(1, 6) && !admit(1, 6) && admit(1, 9));
@@ -156,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn another_program_is_heard_once_the_first_is_gone() {
+    fn another_sender_is_accepted_once_the_first_has_gone() {
         let (mut remote, now) = (Remote::default(), Instant::now());
         assert!(remote.admit(&envelope(1, 3, 50), Kind::Pose, now));
         assert!(!remote.admit(&envelope(2, 1, 1), Kind::Pose, now));
@@ -166,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn silence_has_its_cause() {
+    fn silence_is_reported_with_its_cause() {
         let (mut remote, now) = (Remote::default(), Instant::now());
         let cause = |remote: &Remote, now| remote.silence("rig", "tcp/robot:7447", now);
         assert!(cause(&remote, now).unwrap().contains("tcp/robot:7447"));
@@ -179,7 +181,7 @@ mod tests {
         assert_eq!((missing, cause(&remote, now)), (vec![Kind::Graph], None));
         presence.is_joined = 0;
         remote.answer(&envelope(1, 1, 0), &presence, ANSWER, now);
-        assert!(cause(&remote, now).unwrap().contains("does not run"));
-        assert!(cause(&remote, now + 2 * LONGEST_SILENCE).unwrap().contains("no word"));
+        assert!(cause(&remote, now).unwrap().contains("is not running"));
+        assert!(cause(&remote, now + 2 * LONGEST_SILENCE).unwrap().contains("no messages"));
     }
 }

@@ -1,7 +1,7 @@
-//! Sending: reads the topics of the local instance and puts them on Zenoh.
+//! Reads the topics of the local instance and publishes them on Zenoh.
 //!
-//! Three threads: one reads shared memory and never waits for the network, one puts what is urgent (poses, health), one
-//! packs and puts what is large. Between them are queues in which the newest wins.
+//! Three threads: one reads shared memory and never waits for the network, one sends urgent messages (poses,
+//! health), one packs and sends large ones. The queues between them keep the newest items.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -30,36 +30,36 @@ use crate::zenoh::packing::{pack_image, pack_plain, pack_points};
 use crate::zenoh::rate::{Latest, Rate};
 use crate::zenoh::traffic::Traffic;
 
-/// Longest wait for a message without a look at what is due.
+/// Upper limit for a wait for messages before due keyframes are checked.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
-/// Poses that wait for the network: two seconds of a camera of 30 Hz. Older ones are of no use at the other end.
+/// Poses queued for the network: two seconds of a camera at 30 Hz. Older ones are useless at the other end.
 const WAITING_POSES: usize = 60;
-/// Of each process's health.
+/// Health reports of each process queued for the network.
 const WAITING_HEALTH: usize = 2;
-/// Joint estimates that wait for the network: some seconds of them.
+/// Joint estimates queued for the network: those of a few seconds.
 const WAITING_ADJUSTMENTS: usize = 16;
 
-/// What is sent besides poses, health and the map.
+/// Settings for sending frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FrameOptions {
     /// Quality of the JPEG, 1 to 100.
     pub jpeg_quality: u8,
-    /// Most frames a second.
+    /// Maximum rate of frames.
     pub rate_hz: f64,
 }
 
-/// What is sent where.
+/// What is sent, and where.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SendOptions {
-    /// Links.
+    /// Addresses of the links.
     pub endpoints: Endpoints,
-    /// Frames, where they are wanted.
+    /// How frames are sent; `None` for no frames.
     pub frames: Option<FrameOptions>,
-    /// Most revisions of a keyframe's depth a second; a new keyframe goes out at once.
+    /// Maximum rate of revisions of a keyframe's depth; a new keyframe is sent at once.
     pub keyframe_rate_hz: f64,
 }
 
-/// Something to be put.
+/// An item to send.
 enum Item {
     Pose(Box<PoseMessage>),
     Health(Kind, Box<HealthMessage>),
@@ -69,12 +69,12 @@ enum Item {
     Frame(Arc<Frame>),
 }
 
-/// Sends until the signal. Waits for an instance that does not run yet, and for the next one after it.
+/// Sends until a signal arrives. Waits for an instance that is not running yet, and for the next one after it.
 pub fn send(place: &Place, options: &SendOptions, shutdown: &Shutdown) -> Result<(), ZenohError> {
     let network = open(&options.endpoints)?;
     let outlet = Arc::new(Outlet::new(sender_id(&network)));
     declare_answers(&network, &place.instance, &outlet)?;
-    // By kind; each queue leaves the slots of the other's empty.
+    // By kind; each queue leaves the slots of the other's kinds empty.
     let depths = Kind::ALL.map(|kind| match kind {
         Kind::Pose => WAITING_POSES,
         Kind::CaptureHealth | Kind::TrackerHealth | Kind::MapperHealth => WAITING_HEALTH,
@@ -109,12 +109,12 @@ pub fn send(place: &Place, options: &SendOptions, shutdown: &Shutdown) -> Result
         outcome
     });
     drop(publishers);
-    // What cannot be told any more is noticed by the other side's lease.
+    // If this cannot be sent, the other side notices by its lease.
     let _ = network.close().wait();
     outcome
 }
 
-/// Reads shared memory, and gives what is to be sent to the other threads.
+/// Reads shared memory and passes messages to the other threads.
 struct Reader<'a> {
     outlet: &'a Outlet,
     urgent: &'a Slots<Item>,
@@ -138,7 +138,7 @@ impl Reader<'_> {
         Ok(())
     }
 
-    /// Messages that the network did not take in time, as the log names them.
+    /// Messages dropped because the network was too slow, as named in the log.
     fn dropped(&self) -> [(&'static str, u64); 5] {
         let urgent = |kind: &Kind| self.urgent.dropped(*kind as usize);
         let large = |kind: Kind| self.large.dropped(kind as usize);
@@ -163,7 +163,7 @@ impl Reader<'_> {
                 self.outlet.begin_run();
             }
             Event::Left => {
-                tracing::info!("the instance is gone");
+                tracing::info!("the instance has ended");
                 self.outlet.end_run();
                 self.keyframes.forget();
             }
@@ -185,7 +185,7 @@ impl Reader<'_> {
     }
 }
 
-/// Answers who asks for presence, or for the last message of a kind.
+/// Answers queries for presence and for the last message of a kind.
 fn declare_answers(
     network: &ZenohSession,
     instance: &str,
@@ -200,7 +200,7 @@ fn declare_answers(
                 _ => outlet.last(kind),
             };
             if let Some(bytes) = bytes {
-                // Who asked may be gone.
+                // The querier may have gone.
                 let _ = query.reply(query.key_expr().clone(), bytes).express(true).wait();
             }
         };
@@ -210,17 +210,17 @@ fn declare_answers(
     Ok(())
 }
 
-/// Packs messages, numbers and puts them.
+/// Packs, numbers and sends messages.
 struct Putter<'a> {
     publishers: &'a [Publisher<'static>],
     outlet: &'a Outlet,
     jpeg_quality: u8,
-    /// Run, epoch and id of the keyframe whose image went out last.
+    /// Run, epoch and id of the keyframe whose image was sent last.
     image_of: Option<(u64, u32, u64)>,
 }
 
 impl Putter<'_> {
-    /// Puts what waits in `items` until they are closed.
+    /// Sends queued items until the queue is closed.
     fn run(mut self, items: &Slots<Item>) {
         while let Some(item) = items.take() {
             match item {
@@ -241,13 +241,13 @@ impl Putter<'_> {
 
     fn put<T: IntoBytes + Immutable>(&self, kind: Kind, message: &T, payload: &Packed) {
         let bytes = self.outlet.seal(kind, message, payload);
-        // Dropped on a congested link: receivers see it by the numbers.
+        // Dropped on a congested link: receivers notice by the numbers.
         if let Err(error) = self.publishers[kind as usize].put(bytes).wait() {
             tracing::debug!("{error}");
         }
     }
 
-    /// Image before depth, and once: it serves every revision.
+    /// Sends the image before the depth, and only once: it serves every revision.
     fn put_keyframe(&mut self, keyframe: &Keyframe) {
         let (id, revision) = (keyframe.keyframe_id, keyframe.revision);
         let image_of = Some((self.outlet.run(), keyframe.epoch, id));
@@ -265,7 +265,7 @@ impl Putter<'_> {
         self.put(Kind::Keyframe, &keyframe_header(keyframe), &payload);
     }
 
-    /// Frames are packed only where somebody takes them.
+    /// Sends a frame if it has a subscriber; otherwise it is not even packed.
     fn put_frame(&self, frame: &Frame) {
         let status = self.publishers[Kind::Frame as usize].matching_status().wait();
         if !status.is_ok_and(|status| status.matching()) {

@@ -1,4 +1,4 @@
-//! What the receiver's threads share: the queues between them, and what is known of the sender.
+//! State shared by the receiver's threads: the queues between them, and the state of the sender.
 
 use std::io::Write;
 use std::os::unix::net::UnixStream;
@@ -15,13 +15,13 @@ use crate::zenoh::remote::Remote;
 use crate::zenoh::stamps::translate;
 use crate::zenoh::unpack::{Arrival, unpack};
 
-/// Poses that wait for the main thread: what came while the machine was busy for seconds.
+/// Poses queued for the main thread: those that arrive while the machine is busy for seconds.
 const WAITING_POSES: usize = 256;
 
-/// Of health, joint estimates.
+/// Queued health reports and joint estimates.
 const WAITING_SMALL: usize = 16;
 
-/// What the receiver's threads share.
+/// The queues and the sender's state.
 #[derive(Debug)]
 pub struct Shared {
     remote: Mutex<Remote>,
@@ -33,9 +33,9 @@ pub struct Shared {
 }
 
 impl Shared {
-    /// Empty; `wake` wakes the main thread.
+    /// Empty queues; `wake` wakes the main thread.
     pub(super) fn new(wake: UnixStream) -> Self {
-        // By kind; those that do not go there stay empty.
+        // By kind; slots of kinds that a queue never holds stay empty.
         let depths = Kind::ALL.map(|kind| match kind {
             Kind::Pose => WAITING_POSES,
             Kind::Keyframe | Kind::KeyframeImage | Kind::Graph | Kind::Frame => 1,
@@ -45,12 +45,12 @@ impl Shared {
         Self { remote: Mutex::default(), urgent, large, ready: Slots::new(&depths), wake }
     }
 
-    /// What is known of the sender.
+    /// Locks the state of the sender.
     pub fn remote(&self) -> MutexGuard<'_, Remote> {
         self.remote.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes in a message; never waits.
+    /// Queues a message; never waits.
     pub fn arrive(&self, kind: Kind, bytes: ZBytes) {
         if kind.is_urgent() {
             self.urgent.put(kind as usize, (kind, bytes));
@@ -61,11 +61,11 @@ impl Shared {
     }
 
     fn wake(&self) {
-        // A full pipe wakes as well.
+        // A full socket buffer wakes the thread as well.
         let _ = (&self.wake).write(&[0]);
     }
 
-    /// Checks an envelope that came as one of `kind`; `None` where it is none.
+    /// Checks an envelope received for `kind`; `None` if it is invalid.
     pub(super) fn open<'a>(&self, kind: Kind, bytes: &'a [u8]) -> Option<Opened<'a>> {
         match open(bytes) {
             Ok(opened) if opened.kind == kind => return Some(opened),
@@ -77,7 +77,7 @@ impl Shared {
         None
     }
 
-    /// Checks and unpacks; `None` for what is not to be used.
+    /// Checks and unpacks a message; `None` if it is not to be used.
     pub(super) fn unpack(&self, kind: Kind, bytes: &ZBytes) -> Option<Arrival> {
         let bytes = bytes.to_bytes();
         let opened = self.open(kind, &bytes)?;
@@ -97,7 +97,7 @@ impl Shared {
         }
     }
 
-    /// Unpacks what is large until the queue is closed.
+    /// Unpacks large messages until the queue is closed.
     pub(super) fn unpack_large(&self) {
         while let Some((kind, bytes)) = self.large.take() {
             if let Some(arrival) = self.unpack(kind, &bytes) {

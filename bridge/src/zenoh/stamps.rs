@@ -1,10 +1,10 @@
-//! Stamps of CLOCK_MONOTONIC in terms of the receiver's clock. Those of CLOCK_REALTIME and `capture_nanos` stay as they are:
-//! the one is of all machines, the other of the camera or the recording.
+//! Converts stamps of CLOCK_MONOTONIC to the receiver's clock. Those of CLOCK_REALTIME and `capture_nanos`
+//! are unchanged: the former is common to all machines, the latter belongs to the camera or the recording.
 
 use crate::zenoh::clock_offset::ClockOffset;
 use crate::zenoh::unpack::Arrival;
 
-/// Translates the stamps of what arrived at `now_nanos`: nothing was sent after it arrived.
+/// Converts the stamps of a message that arrived at `now_nanos`: nothing was sent after it arrived.
 pub fn translate(arrival: &mut Arrival, clock: &ClockOffset, now_nanos: i64) {
     let local = |stamp: &mut i64| *stamp = clock.local_nanos(*stamp).min(now_nanos);
     match arrival {

@@ -1,14 +1,14 @@
-//! What the sender tells the log: messages and bytes of each kind, and what was dropped.
+//! The sender's log of traffic: messages and bytes of each kind, and drops.
 
 use std::time::{Duration, Instant};
 
 use crate::zenoh::kind::Kind;
 use crate::zenoh::outlet::Outlet;
 
-/// Time between two lines.
+/// Time between two log lines.
 const PERIOD: Duration = Duration::from_secs(10);
 
-/// Counters as of the last line.
+/// Counters as of the last log line.
 #[derive(Debug)]
 pub struct Traffic {
     told: Instant,
@@ -18,14 +18,14 @@ pub struct Traffic {
 }
 
 impl Default for Traffic {
-    /// Nothing told yet.
+    /// Counters before the first log line.
     fn default() -> Self {
         Self { told: Instant::now(), counts: [0; Kind::COUNT], bytes: [0; Kind::COUNT], dropped: 0 }
     }
 }
 
 impl Traffic {
-    /// Tells what went since the last line, where that is due.
+    /// Logs the traffic since the last line, if that is due.
     pub fn tell(
         &mut self,
         outlet: &Outlet,
@@ -55,7 +55,7 @@ impl Traffic {
         let line = format!("dropped: {}; refused {refused}", names.join(", "));
         tracing::info!("sent: {}; {line}", rates.join(", "));
         if sum > self.dropped {
-            tracing::warn!("the network does not take messages in time; {line}");
+            tracing::warn!("the network is too slow for the messages; {line}");
         }
         *self = Self { told: Instant::now(), counts, bytes, dropped: sum };
     }

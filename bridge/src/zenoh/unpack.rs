@@ -1,4 +1,4 @@
-//! What arrived as the messages that lie in shared memory, checked to the last number: the network is not trusted.
+//! Converts network messages to those of shared memory, with every number checked: the network is not trusted.
 
 use semidense::service::health::ProcessState;
 use semidense::slam::geometry::intrinsics::Intrinsics;
@@ -21,43 +21,43 @@ use crate::zenoh::kind::Kind;
 use crate::zenoh::outlet::Presence;
 use crate::zenoh::packing::{UnpackError, unpack_image, unpack_points};
 
-/// Most pixels of an image: 4096 × 3072. Shared memory for 46 of them is taken.
+/// Upper limit for the pixels of an image: 4096 × 3072. Shared memory is allocated for 46 of them.
 const MAX_PIXELS: usize = 4096 * 3072;
 
-/// A message as it lies in shared memory.
+/// A message as in shared memory.
 #[derive(Debug, Clone)]
 pub enum Arrival {
-    /// Of `tracker/pose`.
+    /// From `tracker/pose`.
     Pose(Box<PoseMessage>),
-    /// Of the health of a process.
+    /// From the health of a process.
     Health(Kind, Box<HealthMessage>),
-    /// Of `mapper/adjustment`.
+    /// From `mapper/adjustment`.
     Adjustment(AdjustmentMessage),
-    /// Of `mapper/graph`.
+    /// From `mapper/graph`.
     Graph(GraphHeader, Vec<KeyframePoseMessage>),
-    /// Of `mapper/keyframe_image`.
+    /// From `mapper/keyframe_image`.
     KeyframeImage(KeyframeImageHeader, Vec<u8>),
-    /// Of `mapper/keyframe`.
+    /// From `mapper/keyframe`.
     Keyframe(Box<KeyframeHeader>, Vec<DepthPoint>),
-    /// Of `capture/frame`.
+    /// From `capture/frame`.
     Frame(FrameHeader, Vec<u8>),
-    /// That the sender is there.
+    /// The sender's presence.
     Presence(Presence),
 }
 
 /// Why a message is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum ArrivalError {
-    /// By its envelope.
+    /// Its envelope is invalid.
     #[error(transparent)]
     Envelope(#[from] EnvelopeError),
-    /// By its payload.
+    /// Its payload is invalid.
     #[error(transparent)]
     Unpack(#[from] UnpackError),
-    /// By what it says.
+    /// Its content is invalid.
     #[error(transparent)]
     Message(#[from] MessageError),
-    /// By its JPEG.
+    /// Its JPEG is invalid.
     #[error(transparent)]
     Jpeg(#[from] jpeg::JpegError),
 }
@@ -144,7 +144,7 @@ fn graph(opened: &Opened<'_>) -> Result<Vec<KeyframePoseMessage>, ArrivalError> 
     Ok(poses)
 }
 
-/// Counters mean nothing wrong; codes and lengths do.
+/// Checks codes and lengths; counters cannot be invalid.
 fn health(message: HealthMessage) -> Result<HealthMessage, MessageError> {
     if ProcessState::from_code(message.state).is_none() {
         return Err(MessageError::UnknownCode { field: "state", code: message.state });
@@ -159,7 +159,7 @@ fn health(message: HealthMessage) -> Result<HealthMessage, MessageError> {
 }
 
 fn adjustment(message: AdjustmentMessage) -> Result<AdjustmentMessage, MessageError> {
-    /// Codes of what became of one.
+    /// Number of codes for the fate of an adjustment.
     const FATES: u32 = 3;
     if message.fate >= FATES {
         return Err(MessageError::UnknownCode { field: "fate", code: message.fate });

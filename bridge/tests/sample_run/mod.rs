@@ -1,4 +1,4 @@
-//! A small run as events, for tests that need no pipeline.
+//! A small run as a list of events, for tests without a pipeline.
 #![allow(dead_code, reason = "every test uses its part of it")]
 
 use std::path::{Path, PathBuf};
@@ -19,13 +19,13 @@ pub const WIDTH: usize = 64;
 pub const HEIGHT: usize = 48;
 pub const CAMERA: Intrinsics =
     Intrinsics { fx: 50.0, fy: 50.0, cx: 31.5, cy: 23.5, width: WIDTH, height: HEIGHT };
-/// CLOCK_REALTIME of frame 0: an instant with every digit in use.
+/// CLOCK_REALTIME of frame 0: a value with every digit in use.
 pub const REALTIME: i64 = 1_750_000_000_123_456_789;
 /// The source's clock at frame 0.
 pub const CAPTURE: i64 = 5_000_000_007;
 pub const PERIOD: i64 = 33_333_333;
 
-/// Noise that depends on the frame: no two pixels follow from each other.
+/// Noise that depends on the frame, with uncorrelated pixels.
 pub fn pixels(frame: u64) -> Vec<u8> {
     let mut state = frame as u32 * 7919 + 1;
     let mut next = || {
@@ -52,7 +52,7 @@ pub fn frame(sequence: u64) -> Event {
     Event::Frame(Arc::new(Frame { header, intrinsics: CAMERA, pixels }))
 }
 
-/// The camera goes ahead by a hundredth a frame, 1 to the right of the world's origin.
+/// The camera moves ahead by 0.01 per frame, at 1 to the right of the world's origin.
 pub fn pose(sequence: u64) -> Event {
     let later = sequence as i64 * PERIOD;
     let view = FrameView {
@@ -96,7 +96,7 @@ pub fn health(owner: &'static str) -> Event {
     Event::Health(owner, Box::new(message))
 }
 
-/// A run of `num_frames` frames, every kind of event in it.
+/// A run of `num_frames` frames with every kind of event.
 pub fn run(num_frames: u64) -> Vec<Event> {
     let mut events = vec![Event::Joined, keyframe(1), graph()];
     for sequence in 0..num_frames {
@@ -108,7 +108,7 @@ pub fn run(num_frames: u64) -> Vec<Event> {
     events
 }
 
-/// A script beside the tests.
+/// A script next to the tests.
 pub fn script(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/scripts").join(name)
 }

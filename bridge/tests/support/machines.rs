@@ -1,4 +1,4 @@
-//! Programs on several machines: a runtime folder for each, and what they have said so far.
+//! Programs on several machines: a runtime folder for each, and their output so far.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -10,7 +10,7 @@ use semidense::wire::port::{Access, Hub};
 
 use super::until;
 
-/// A folder for an instance, removed with what is left in shared memory.
+/// A folder for an instance, removed together with its remains in shared memory.
 pub struct Root {
     folder: tempfile::TempDir,
     instance: String,
@@ -18,7 +18,7 @@ pub struct Root {
 
 impl Root {
     pub fn new(instance: &str) -> Self {
-        // In /tmp: the path of a runtime folder may have few bytes.
+        // In /tmp: the path of a runtime folder is limited in length.
         let folder = tempfile::tempdir_in("/tmp").unwrap();
         Self { folder, instance: instance.to_owned() }
     }
@@ -43,14 +43,14 @@ impl Drop for Root {
     }
 }
 
-/// A program that runs, with what it has written to standard error so far. Killed when dropped.
+/// A running program, with its standard error so far. Killed when dropped.
 pub struct Running {
     child: Child,
     stderr: Arc<Mutex<String>>,
 }
 
 impl Running {
-    /// Starts it with the runtime folder of `root`.
+    /// Starts the program with the runtime folder `root`.
     pub fn start(mut command: Command, root: &Path) -> Self {
         command.env("SEMIDENSE_ROOT", root).stdin(Stdio::null()).stdout(Stdio::null());
         let mut child = command.stderr(Stdio::piped()).spawn().unwrap();
@@ -66,26 +66,26 @@ impl Running {
         Self { child, stderr }
     }
 
-    /// What it has said so far.
+    /// Its standard error so far.
     pub fn said(&self) -> String {
         self.stderr.lock().unwrap().clone()
     }
 
-    /// Waits until it has said `text`.
+    /// Waits until it has printed `text`.
     pub fn wait_for(&self, text: &str) {
         until(&format!("`{text}`; it said: {}", self.said()), || {
             self.said().contains(text).then_some(())
         });
     }
 
-    /// Sends it a signal by name.
+    /// Sends a signal by name.
     pub fn signal(&self, name: &str) {
         let id = self.child.id().to_string();
         let status = Command::new("kill").args(["-s", name, &id]).status().unwrap();
         assert!(status.success());
     }
 
-    /// Waits for its end; whether it ended well.
+    /// Waits for its end; returns whether it succeeded.
     pub fn end(&mut self) -> bool {
         until("the end of a program", || self.child.try_wait().unwrap()).success()
     }

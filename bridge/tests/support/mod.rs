@@ -1,5 +1,5 @@
-//! What the tests of the bridge share: an instance of its own for each test, runs of the real binaries beside each other,
-//! and the tools of other projects that judge what comes out.
+//! Shared parts of the bridge's tests: a separate instance for each test, runs of the real binaries alongside
+//! each other, and other projects' tools that check the output.
 
 #![allow(dead_code, reason = "every test uses its part of what they share")]
 
@@ -16,16 +16,16 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-/// Far above anything that is expected: it ends a test that hangs, it measures nothing.
+/// Far above any expected duration: it ends a test that hangs, it measures nothing.
 pub const WATCH_DOG: Duration = Duration::from_secs(240);
 
-/// An instance of its own: its folder and what it writes.
+/// A separate instance: its folder and its output.
 pub struct Rig {
     folder: tempfile::TempDir,
 }
 
 impl Rig {
-    /// In a folder whose name is short: sockets lie in it.
+    /// In a folder with a short name: it contains sockets.
     pub fn new() -> Self {
         Self { folder: tempfile::tempdir_in("/tmp").unwrap() }
     }
@@ -77,7 +77,7 @@ impl Rig {
         command
     }
 
-    /// A live page on a port that is free, and its address as it is printed.
+    /// A live page on a free port, and its printed address.
     pub fn view(&self, arguments: &[&str]) -> (Process, String) {
         let arguments = [&["view", "--listen", "127.0.0.1:0"], arguments].concat();
         let mut process = Process::start(self.bridge(&arguments));
@@ -86,7 +86,7 @@ impl Rig {
     }
 }
 
-/// The program `semidense`, which is built beside `semidense-bridge`.
+/// The program `semidense`, which is built next to `semidense-bridge`.
 pub fn semidense() -> PathBuf {
     let named = std::env::var_os("SEMIDENSE").map(PathBuf::from);
     let beside = Path::new(env!("CARGO_BIN_EXE_semidense-bridge")).with_file_name("semidense");
@@ -99,7 +99,7 @@ pub fn semidense() -> PathBuf {
     program
 }
 
-/// A process that is killed when it is not needed any more.
+/// A process that is killed when dropped.
 pub struct Process {
     child: Child,
     stdout: BufReader<ChildStdout>,
@@ -107,7 +107,7 @@ pub struct Process {
 
 impl Process {
     pub fn start(mut command: Command) -> Self {
-        // What it says is seen where the test fails; a pipe that nobody reads would hold it up.
+        // Its errors are shown where the test fails; an unread pipe would block it.
         let mut child = command.stderr(Stdio::inherit()).spawn().unwrap();
         let stdout = BufReader::new(child.stdout.take().unwrap());
         Self { child, stdout }
@@ -117,7 +117,7 @@ impl Process {
         self.child.id()
     }
 
-    /// The next line that it prints.
+    /// The next line of its output.
     pub fn line(&mut self) -> String {
         let mut line = String::new();
         self.stdout.read_line(&mut line).unwrap();
@@ -159,7 +159,7 @@ pub fn finish(mut command: Command) -> Output {
     output
 }
 
-/// The same, which must succeed; gives what it has printed.
+/// The same for a command that must succeed; returns its output.
 pub fn succeed(command: Command) -> String {
     let output = finish(command);
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
@@ -167,7 +167,7 @@ pub fn succeed(command: Command) -> String {
     text(&output.stdout)
 }
 
-/// Asks again and again until there is an answer.
+/// Calls `ask` repeatedly until there is an answer.
 pub fn until<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
     let start = Instant::now();
     loop {
@@ -179,12 +179,12 @@ pub fn until<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// Where the tools of other projects are, as `bridge/tests/tools` installs them.
+/// Folder of other projects' tools, as installed by `bridge/tests/tools`.
 pub fn tools() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/test-tools")
 }
 
-/// Whether a tool is there. In CI it must be; elsewhere the test says that it is left out.
+/// Whether a tool is installed. In CI it must be; elsewhere the test reports that it is skipped.
 pub fn has_tool(path: &Path) -> bool {
     let is_there = path.exists();
     assert!(
@@ -198,7 +198,7 @@ pub fn has_tool(path: &Path) -> bool {
     is_there
 }
 
-/// Sends bytes to an address `http://HOST:PORT/…` and gives all that is answered.
+/// Sends bytes to an address `http://HOST:PORT/…` and returns the whole answer.
 pub fn ask(address: &str, request: &[u8]) -> String {
     let host = address.strip_prefix("http://").unwrap().split('/').next().unwrap();
     let mut stream = TcpStream::connect(host.parse::<SocketAddr>().unwrap()).unwrap();
@@ -209,7 +209,7 @@ pub fn ask(address: &str, request: &[u8]) -> String {
     String::from_utf8_lossy(&answer).into_owned()
 }
 
-/// A request for a path with the usual head and further lines.
+/// Requests a path with the usual head and further lines.
 pub fn get(address: &str, path: &str, lines: &str) -> String {
     let host = address.strip_prefix("http://").unwrap().split('/').next().unwrap();
     ask(address, format!("GET {path} HTTP/1.1\r\nHost: {host}\r\n{lines}\r\n").as_bytes())

@@ -1,4 +1,4 @@
-//! Network namespaces: a host and robots, each with a cable of its own to the host.
+//! Network namespaces: a host and robots, each with its own cable to the host.
 
 use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -10,7 +10,7 @@ pub struct Network {
 }
 
 impl Network {
-    /// A host with so many robots; `None`, said on standard error, where this user may not make namespaces.
+    /// A host with this many robots; `None`, reported on standard error, if this user may not create namespaces.
     pub fn new(robots: usize) -> Option<Self> {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
@@ -57,7 +57,7 @@ impl Network {
         in_namespace(&self.robot(robot), program)
     }
 
-    /// Pulls the cable of a robot, or plugs it in.
+    /// Unplugs the cable of a robot, or plugs it in.
     pub fn connect(&self, robot: usize, is_connected: bool) {
         let state = if is_connected { "up" } else { "down" };
         self.ip(&["-n", &self.host(), "link", "set", &format!("h{robot}"), state]);
@@ -81,7 +81,7 @@ impl Network {
 impl Drop for Network {
     fn drop(&mut self) {
         for name in (0..self.robots).map(|robot| self.robot(robot)).chain([self.host()]) {
-            // One that was not made is not there.
+            // A namespace that was not created does not exist.
             let _ = Command::new("ip").args(["netns", "del", &name]).output();
         }
     }
@@ -96,7 +96,7 @@ fn host_address(robot: usize) -> String {
     format!("10.77.{robot}.1")
 }
 
-/// `ip netns exec` becomes the program: its process id is the child's.
+/// `ip netns exec` becomes the program: its process id is that of the child.
 fn in_namespace(namespace: &str, program: &str) -> Command {
     let mut command = Command::new("ip");
     command.args(["netns", "exec", namespace, program]);

@@ -1,4 +1,4 @@
-//! An instance without a camera: it publishes what a pipeline publishes, with contents that a test knows.
+//! An instance without a camera: it publishes what a pipeline publishes, with content known to the test.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -23,25 +23,25 @@ use zerocopy::FromZeros;
 
 /// Size of its images.
 pub const SIZE: [usize; 2] = [320, 240];
-/// 30 frames a second.
+/// Period of 30 frames a second.
 const PERIOD: Duration = Duration::from_nanos(33_333_333);
-/// Points of its keyframe: 960 kB as a cloud of ROS.
+/// Points of its keyframe: 960 kB as a ROS cloud.
 pub const POINTS: usize = 48_000;
 /// Poses in its graph.
 const KEYFRAMES: usize = 50;
 /// No rotation, no translation, scale 1.
 const IDENTITY: [f64; 8] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
 
-/// What it has sent.
+/// Messages sent so far.
 #[derive(Default)]
 pub struct Sent {
-    /// By sequence, with the instant of sending.
+    /// By sequence, with the time of sending.
     pub poses: BTreeMap<u64, (PoseMessage, i64)>,
     /// By sequence.
     pub frames: BTreeMap<u64, FrameHeader>,
 }
 
-/// It runs on a thread of its own until it is dropped.
+/// A robot that runs on a separate thread until it is dropped.
 pub struct Robot {
     sent: Arc<Mutex<Sent>>,
     shall_end: Arc<AtomicBool>,
@@ -49,7 +49,7 @@ pub struct Robot {
 }
 
 impl Robot {
-    /// Publishes at `place`; `number` tells its messages from those of other robots.
+    /// Publishes at `place`; `number` distinguishes its messages from those of other robots.
     pub fn start(place: &Place, number: u64) -> Self {
         let sent = Arc::<Mutex<Sent>>::default();
         let shall_end = Arc::<AtomicBool>::default();
@@ -58,7 +58,7 @@ impl Robot {
         Self { sent, shall_end, thread: Some(thread) }
     }
 
-    /// A look at what it has sent.
+    /// Inspects the messages sent so far.
     pub fn sent<T>(&self, look: impl FnOnce(&Sent) -> T) -> T {
         look(&self.sent.lock().unwrap())
     }
@@ -72,7 +72,7 @@ impl Robot {
 impl Drop for Robot {
     fn drop(&mut self) {
         self.shall_end.store(true, Ordering::Release);
-        // A panic of it is seen in its output.
+        // A panic of the thread shows in its output.
         let _ = self.thread.take().map(JoinHandle::join);
     }
 }
@@ -91,7 +91,7 @@ fn run(place: &Place, number: u64, log: &Mutex<Sent>, end: &AtomicBool) {
         .iter()
         .map(|topic| hub.publisher(topic, 1).unwrap())
         .collect();
-    // Opened by subscribers though nothing is said on it.
+    // Subscribers open this topic although nothing is sent on it.
     let _adjustments: Publisher<AdjustmentMessage, ()> = hub.publisher(&ADJUSTMENT, 1).unwrap();
     images.send(keyframe_image_header(number), &image(number)).unwrap();
     depths.send(keyframe_header(number), &points(number)).unwrap();
@@ -120,7 +120,7 @@ fn run(place: &Place, number: u64, log: &Mutex<Sent>, end: &AtomicBool) {
     }
 }
 
-/// Numbers that look like any: the same for the same `seed`.
+/// Pseudo-random numbers: the same for the same `seed`.
 fn noise(seed: u64) -> impl FnMut() -> f64 {
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     move || {
@@ -176,7 +176,7 @@ fn frame_header(sequence: u64, now: i64) -> FrameHeader {
     }
 }
 
-/// Smooth, as JPEG likes it.
+/// A smooth image, which suits JPEG.
 pub fn image(number: u64) -> Vec<u8> {
     let [width, height] = SIZE;
     let pixel = |i: usize| ((i % width) / 2 + (i / width) / 3 + number as usize % 16) as u8;

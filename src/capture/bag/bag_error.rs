@@ -11,7 +11,7 @@ pub enum BagError {
     #[error("cannot be read: {0}; check the path and its permissions")]
     Read(#[from] std::io::Error),
     /// Not an MCAP file.
-    #[error("is not an MCAP file; write a bag as one with `ros2 bag convert` or `mcap convert`")]
+    #[error("is not an MCAP file; convert a bag with `ros2 bag convert` or `mcap convert`")]
     NotMcap,
     /// A record that is invalid for its kind.
     #[error("is damaged at byte {at}: {reason}; `mcap recover` saves what can be read")]
@@ -25,7 +25,7 @@ pub enum BagError {
     #[error("has no topic with images (sensor_msgs/Image or CompressedImage); it has {0}")]
     NoImages(String),
     /// Several topics of images.
-    #[error("has several topics with images: name one as mcap:FILE:TOPIC, of {0}")]
+    #[error("has several topics with images: name one of {0}, as mcap:FILE:TOPIC")]
     SeveralTopics(String),
     /// The named topic does not exist or has no images.
     #[error("has no images on the topic `{topic}`; topics with images are {known}")]
@@ -36,7 +36,7 @@ pub enum BagError {
         known: String,
     },
     /// No message describes the camera.
-    #[error("has no CameraInfo beside `{0}`; name the camera with --rig FILE")]
+    #[error("has no CameraInfo next to `{0}`; name the camera with --rig FILE")]
     NoCamera(String),
     /// A `CameraInfo` from which no rig can be made.
     #[error("CameraInfo of `{topic}`: {reason}; name the camera with --rig FILE")]
@@ -64,13 +64,13 @@ pub enum BagImageError {
     #[error(transparent)]
     Decode(#[from] DecodeError),
     /// Its stamp is not later than that of the previous image.
-    #[error("has the stamp {nanos} ns, which does not come after the one before")]
+    #[error("has the stamp {nanos} ns, which is not later than the previous one")]
     Disordered {
         /// Its stamp.
         nanos: i64,
     },
     /// The chunk that contained it is damaged.
-    #[error("is lost with a part of the file that is damaged at byte {at}: {reason}")]
+    #[error("is lost: the file is damaged at byte {at}: {reason}")]
     Chunk {
         /// Where the record begins.
         at: u64,

@@ -16,7 +16,7 @@ pub fn rig_of(camera: &CameraInfo, topic: &str, path: &Path) -> Result<Rig, Stri
         return Err("its images are binned".to_owned());
     }
     if camera.roi != [0; 4] && camera.roi[2..] != [camera.height, camera.width] {
-        return Err("its images are a part of the sensor".to_owned());
+        return Err("its images cover only part of the sensor".to_owned());
     }
     let coefficients = coefficients(camera)?;
     let is_fisheye = matches!(camera.distortion_model.as_str(), "equidistant" | "fisheye");
@@ -51,7 +51,7 @@ fn coefficients(camera: &CameraInfo) -> Result<Vec<f64>, String> {
         _ => {
             let name: String = name.chars().take(40).collect();
             return Err(format!(
-                "the lens `{name}` with {} coefficients is not known (plumb_bob with 4 or 5, rational_polynomial with 8, \
+                "the lens `{name}` with {} coefficients is not supported (plumb_bob with 4 or 5, rational_polynomial with 8, \
                  equidistant with 4)",
                 d.len()
             ));

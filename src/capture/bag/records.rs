@@ -158,7 +158,10 @@ impl Records {
         });
         let Some((opcode, length)) = record else {
             self.chunk.clear();
-            return Err(Self::damaged(self.position, "a record in a chunk is longer than that"));
+            return Err(Self::damaged(
+                self.position,
+                "a record in a chunk is longer than the chunk",
+            ));
         };
         let begin = self.chunk_position + PREFIX_BYTES;
         self.chunk_position = begin + length;

@@ -41,7 +41,7 @@ impl Feed {
             Self::Program(program) => program.connect(now)?,
         };
         if let Some(stream) = &stream {
-            let refused = |error| Absence::passing(format!("its stream is refused ({error})"));
+            let refused = |error| Absence::passing(format!("its stream was refused ({error})"));
             stream.set_nonblocking(true).map_err(refused)?;
         }
         Ok(stream)
@@ -68,7 +68,7 @@ impl Feed {
     pub fn absence(&self) -> String {
         match self {
             Self::Socket(listener) => format!(
-                "nobody sends frames to {}; start the program that does",
+                "no program sends frames to {}; start the program that does",
                 listener.path.display()
             ),
             Self::Program(program) => program.last.clone(),
@@ -152,13 +152,13 @@ fn bind(path: &Path) -> Result<UnixListener, Absence> {
     let listener = match UnixListener::bind(path) {
         Err(error) if error.kind() == ErrorKind::AddrInUse && is_socket() => {
             if UnixStream::connect(path).is_ok() {
-                let reason = "another process takes frames there; end it or name another path";
+                let reason = "another process receives frames there; stop it or name another path";
                 return Err(Absence::passing(at(reason.to_owned())));
             }
             std::fs::remove_file(path).and_then(|()| UnixListener::bind(path))
         }
         Err(error) if error.kind() == ErrorKind::AddrInUse => {
-            let reason = at("is a file; name a path where a socket can be made".to_owned());
+            let reason = at("is a file; name a path where a socket can be created".to_owned());
             return Err(Absence { reason, passes: false });
         }
         outcome => outcome,
@@ -171,7 +171,7 @@ fn bind(path: &Path) -> Result<UnixListener, Absence> {
         Ok(listener)
     };
     open().map_err(|error: std::io::Error| Absence {
-        reason: at(format!("a socket cannot be made there ({error}); name a path in a folder of this user, of less than 108 bytes")),
+        reason: at(format!("a socket cannot be created there ({error}); name a path in a folder of this user, shorter than 108 bytes")),
         passes: false,
     })
 }
@@ -239,8 +239,8 @@ impl Program {
         let program = self.program.display();
         let status = wait_or_kill(&mut child);
         self.last = match status {
-            Some(status) => format!("{program} has ended ({status}); it is started again"),
-            None => format!("{program} was stopped; it is started again"),
+            Some(status) => format!("{program} exited ({status}); restarting"),
+            None => format!("{program} was stopped; restarting"),
         };
         if status.and_then(|status| status.code()) == Some(WRONG_USAGE) {
             self.last = format!("{program} does not understand `{}`", self.arguments.join(" "));

@@ -56,19 +56,19 @@ pub struct StreamHeader {
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum HeaderError {
     /// Anything but a stream of frames.
-    #[error("these are not frames: a header does not begin with SDFRAME1")]
+    #[error("not a stream of frames: a header does not begin with SDFRAME1")]
     Magic,
     /// An invalid size.
-    #[error("a picture of {0}x{1} pixels; a side has 1 to 8192")]
+    #[error("an image of {0}x{1} pixels; a side has 1 to 8192")]
     Size(u32, u32),
     /// An unknown format.
-    #[error("a picture of the format `{0}`, which is not known")]
+    #[error("an image in the format `{0}`, which is not supported")]
     Format(FourCc),
     /// Rows too short for their pixels, or a JPEG that has rows.
     #[error("rows of {0} bytes, which do not fit the format and the width")]
     Stride(u32),
     /// More or fewer bytes than the picture needs.
-    #[error("a picture of {0} bytes, which do not fit its format and size")]
+    #[error("an image of {0} bytes, which do not fit its format and size")]
     Bytes(u32),
     /// An unknown clock.
     #[error("a stamp of clock {0}; 0 is CLOCK_MONOTONIC, 1 CLOCK_REALTIME, 2 any other")]

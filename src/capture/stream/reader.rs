@@ -25,7 +25,7 @@ pub enum StreamFault {
     #[error(transparent)]
     Header(#[from] HeaderError),
     /// Frames of a size other than the rig's.
-    #[error("frames of {}x{} pixels come, the rig has {}x{}", .found.0, .found.1, .expected.0, .expected.1)]
+    #[error("the stream has frames of {}x{} pixels, the rig {}x{}", .found.0, .found.1, .expected.0, .expected.1)]
     Size {
         /// Size of the frames.
         found: (u32, u32),
@@ -174,7 +174,7 @@ mod tests {
     fn an_invalid_header_and_another_size_are_faults() {
         let mut reader = FrameReader::new((9, 4));
         let size = reader.read(&mut &frame(1, 1)[..]).unwrap_err();
-        assert_eq!(size.to_string(), "frames of 8x4 pixels come, the rig has 9x4");
+        assert_eq!(size.to_string(), "the stream has frames of 8x4 pixels, the rig 9x4");
         reader.restart();
         let other = [b'x'; HEADER_BYTES];
         assert!(reader.read(&mut &other[..]).unwrap_err().to_string().contains("SDFRAME1"));

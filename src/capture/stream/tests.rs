@@ -155,7 +155,7 @@ fn colour_padding_and_jpeg_become_grey() {
 #[test]
 fn a_sender_that_leaves_or_falls_silent_is_a_state_and_another_may_connect() {
     let mut scene = scene();
-    assert!(scene.absence().contains("nobody sends frames to"));
+    assert!(scene.absence().contains("no program sends frames to"));
     let mut first = scene.sender();
     send(&mut first, StreamClock::Other, 1, 1, 1);
     scene.frame();
@@ -171,7 +171,7 @@ fn a_sender_that_leaves_or_falls_silent_is_a_state_and_another_may_connect() {
     send(&mut third, StreamClock::Other, 3, 900, 3);
     assert_eq!(scene.frame().1, 3);
     drop(third);
-    assert!(scene.absence().contains("nobody sends frames to"));
+    assert!(scene.absence().contains("no program sends frames to"));
     let mut fourth = scene.sender();
     send(&mut fourth, StreamClock::Other, 4, 0, 4);
     let (stamp, level) = scene.frame();
@@ -256,7 +256,7 @@ fn a_program_is_restarted_when_it_ends_and_ends_with_its_stream() {
         program_scene(|frame| format!("cat {0}; echo x >> {0}.starts; exit 3", frame.display()));
     assert_eq!(scene.frame().1, 77);
     let reason = scene.absence();
-    assert!(reason.contains("exit status: 3") && reason.contains("started again"), "{reason}");
+    assert!(reason.contains("exit status: 3") && reason.contains("restarting"), "{reason}");
     let starts = scene.folder.path().join("frame.starts");
     let is_again = (0..60).any(|_| {
         let _ = scene.wait(50);

@@ -161,7 +161,7 @@ impl<S: VideoSystem> Camera<S> {
         let grant = negotiate(&mut device, &self.wish).map_err(|error| match error {
             NegotiationError::Device(error) => refused(error),
             error @ NegotiationError::Size { .. } => Absence {
-                reason: at(format!("{error}; name the rig of a size that it gives with --rig")),
+                reason: at(format!("{error}; name a rig of a size that it offers with --rig")),
                 passes: false,
             },
             error => Absence { reason: at(error.to_string()), passes: false },
@@ -169,7 +169,8 @@ impl<S: VideoSystem> Camera<S> {
         if rate_differs(self.wish.rate_hz, grant.rate_hz) {
             let (wanted, granted) =
                 (self.wish.rate_hz.unwrap_or(0.0), grant.rate_hz.unwrap_or(0.0));
-            let text = format!("{wanted:.1} frames a second were asked for, {granted:.1} come");
+            let text =
+                format!("{wanted:.1} frames per second were requested, {granted:.1} are granted");
             self.warn(at(text));
         }
         for refusal in controls::apply(&mut device, &self.params) {
@@ -178,7 +179,7 @@ impl<S: VideoSystem> Camera<S> {
         let num_buffers = device.make_buffers(self.params.buffers).map_err(refused)?;
         if num_buffers < 2 {
             return Err(Absence::passing(at(format!(
-                "its driver makes {num_buffers} buffers, two are needed"
+                "its driver allocates {num_buffers} buffers, two are needed"
             ))));
         }
         for index in 0..num_buffers {
@@ -236,7 +237,9 @@ impl<S: VideoSystem> Camera<S> {
         if silent_nanos as f64 > self.params.stall_s * 1e9 {
             let path = stream.path.display();
             let seconds = self.params.stall_s;
-            return Err(Absence::passing(format!("{path}: gives no frame for {seconds} s")));
+            return Err(Absence::passing(format!(
+                "{path}: has delivered no frame for {seconds} s"
+            )));
         }
         Ok(Arrival::Nothing)
     }
@@ -310,7 +313,7 @@ impl<S: VideoSystem> Camera<S> {
                 stream.return_idle()?;
             }
             if self.is_stamped && !taken.is_stamped {
-                let text = "its driver's stamps are not of CLOCK_MONOTONIC; frames are stamped as they arrive";
+                let text = "its driver's stamps are not from CLOCK_MONOTONIC; frames are stamped as they arrive";
                 note(&mut self.notices, format!("{}: {text}", stream.path.display()), true);
             }
             self.is_stamped = taken.is_stamped;
@@ -372,15 +375,15 @@ impl<D: VideoDevice> Stream<D> {
 /// Explains an error of the kernel for a camera, and what to do.
 fn refusal(error: Errno, path: &dyn std::fmt::Display) -> String {
     match error {
-        Errno::BUSY => format!("in use by another program, which `fuser {path}` names; end it"),
+        Errno::BUSY => format!("in use by another program, which `fuser {path}` names; stop it"),
         Errno::NODEV | Errno::NXIO | Errno::NOENT => "unplugged; plug it in again".to_owned(),
         Errno::ACCESS | Errno::PERM => {
-            "may not be opened; `usermod -aG video USER` and a new login, or SupplementaryGroups=video in the unit"
+            "no permission to open it; run `usermod -aG video USER` and log in again, or set SupplementaryGroups=video in the unit"
                 .to_owned()
         }
         Errno::NOSPC => "the USB bus has no bandwidth left; use another port, a lower rate, or mjpeg".to_owned(),
         Errno::IO => "its driver reports a fault of the device or the cable".to_owned(),
-        error => format!("its driver refuses ({error})"),
+        error => format!("its driver refused the request ({error})"),
     }
 }
 
@@ -394,7 +397,8 @@ fn open_failure(name: &str, failure: OpenFailure) -> Absence {
         }
         OpenFailure::Ambiguous(paths) => {
             let names: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
-            let reason = format!("{name} may be {}; name one of them", names.join(" or "));
+            let reason =
+                format!("{name} is ambiguous: it may be {}; name one of them", names.join(" or "));
             Absence { reason, passes: false }
         }
     }

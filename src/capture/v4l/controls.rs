@@ -120,14 +120,17 @@ impl Knob {
     }
 
     fn refused(&self, error: Errno) -> String {
-        self.complaint(&format!("the camera refuses ({error})"))
+        self.complaint(&format!("the camera refused it ({error})"))
     }
 
     /// The control that holds the value.
     fn value_control(&self, device: &dyn VideoDevice) -> Result<u32, String> {
         let mut there = self.values.iter().copied().filter(|&id| device.control(id).is_some());
         there.next().ok_or_else(|| {
-            self.complaint(&format!("the camera has no {}, which stays as it is", self.name))
+            self.complaint(&format!(
+                "the camera has no control for {}; it stays unchanged",
+                self.name
+            ))
         })
     }
 
@@ -185,7 +188,7 @@ impl Knob {
             return Ok(());
         }
         Err(self.complaint(&format!(
-            "{wanted} was asked for, {granted_units} is set; the camera has {} to {}",
+            "{wanted} was requested, {granted_units} is set; the range is {} to {}",
             minimum * units,
             maximum * units
         )))
@@ -312,7 +315,7 @@ mod tests {
         assert_eq!(refused.len(), 1, "{refused:?}");
         assert!(
             refused[0].contains(
-                "exposure_us: 1000000 was asked for, 204700 is set; the camera has 300 to 204700"
+                "exposure_us: 1000000 was requested, 204700 is set; the range is 300 to 204700"
             ),
             "{refused:?}"
         );

@@ -39,11 +39,11 @@ pub struct Grant {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum NegotiationError {
     /// Not a capture device that streams.
-    #[error("is not a camera that can be used: {0}")]
+    #[error("is not a usable camera: {0}")]
     NoCamera(&'static str),
     /// None of our formats.
     #[error(
-        "offers {offered}, none of the formats asked for; set capture.camera.format = \"auto\""
+        "offers {offered}, none of the requested formats; set capture.camera.format = \"auto\""
     )]
     NoFormat {
         /// The formats offered.
@@ -88,9 +88,11 @@ fn check_capability(device: &dyn VideoDevice) -> Result<(), NegotiationError> {
     let has = |flag: u32| capability.flags & flag != 0;
     let problem = match (has(CAP_VIDEO_CAPTURE), has(CAP_VIDEO_CAPTURE_MPLANE)) {
         (true, _) if has(CAP_STREAMING) => return Ok(()),
-        (true, _) => "it does not stream",
-        (false, true) => "it gives pictures in several planes only",
-        (false, false) => "it gives no pictures; a camera may have several nodes, try the other",
+        (true, _) => "it cannot stream",
+        (false, true) => "it delivers only multi-planar images",
+        (false, false) => {
+            "it delivers no images; a camera may have several device nodes, try another"
+        }
     };
     Err(no_camera(problem))
 }
@@ -148,7 +150,7 @@ fn agree_on_layout(
         let offered = if codes.is_empty() { "nothing".to_owned() } else { codes.join(", ") };
         return Err(NegotiationError::NoFormat { offered });
     };
-    let order = if layout.field > 1 { " in half pictures" } else { "" };
+    let order = if layout.field > 1 { " interlaced" } else { "" };
     Err(NegotiationError::Size {
         found: format!("{}x{} {}{order}", layout.width, layout.height, layout.code),
         wanted: format!("{}x{}", wish.width, wish.height),
@@ -162,7 +164,7 @@ fn offered_sizes(device: &dyn VideoDevice) -> String {
     sizes.sort_by_key(|size| (size.smallest, size.largest));
     sizes.dedup();
     match sizes.as_slice() {
-        [] => "no others that it tells".to_owned(),
+        [] => "no other sizes that its driver reports".to_owned(),
         sizes => sizes.iter().map(SizeRange::to_string).collect::<Vec<_>>().join(", "),
     }
 }
@@ -234,9 +236,9 @@ mod tests {
             fake.set_capability_flags(flags);
             negotiate(&mut fake.device(), &wish(None, None)).unwrap_err().to_string()
         };
-        assert!(refused(CAP_STREAMING).contains("no pictures"), "an output or metadata node");
-        assert!(refused(CAP_VIDEO_CAPTURE).contains("does not stream"));
-        assert!(refused(CAP_VIDEO_CAPTURE_MPLANE | CAP_STREAMING).contains("several planes"));
+        assert!(refused(CAP_STREAMING).contains("no images"), "an output or metadata node");
+        assert!(refused(CAP_VIDEO_CAPTURE).contains("cannot stream"));
+        assert!(refused(CAP_VIDEO_CAPTURE_MPLANE | CAP_STREAMING).contains("multi-planar"));
     }
 
     #[test]

@@ -82,7 +82,7 @@ impl PixelFormat {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum BrokenPicture {
     /// Fewer bytes than the picture needs.
-    #[error("only {found} of {needed} bytes came")]
+    #[error("only {found} of {needed} bytes received")]
     Short {
         /// Bytes received.
         found: usize,

@@ -97,7 +97,7 @@ pub fn find_moved(root: &DeTable) -> Result<(), LayoutError> {
         let first = keys.next().and_then(|key| root.get(key));
         let found = keys.fold(first, |value, key| value?.get_ref().as_table()?.get(key));
         if let Some(value) = found {
-            let reason = format!("`{before}` is `{}` now", listed(now));
+            let reason = format!("`{before}` is now `{}`", listed(now));
             return Err(LayoutError { reason, span: value.span() });
         }
     }

@@ -212,7 +212,7 @@ fn the_camera_noise_is_shared_and_replaced_keys_are_named() {
     let model = ["tracking.alignment.model_noise"];
     let replaced = pixel.map(|key| (key, "pixel")).into_iter();
     for (key, now) in replaced.chain(model.map(|key| (key, "model"))) {
-        let expected = format!("`{key}` is `expert.noise.{now}_std_dev` now");
+        let expected = format!("`{key}` is now `expert.noise.{now}_std_dev`");
         let told = set(&[&format!("{key}=2.0")]).unwrap_err();
         assert!(told.ends_with(&expected), "{told}");
         let (table, name) = key.rsplit_once('.').unwrap();

@@ -91,7 +91,7 @@ impl Machine {
             && limit < priority
         {
             complain(
-                format!("{name} ({number}) may have priorities up to {limit}, {priority} wanted"),
+                format!("{name} ({number}) may have priorities up to {limit}, {priority} needed"),
                 format!("LimitRTPRIO={priority}"),
             );
         }
@@ -137,7 +137,7 @@ mod tests {
         let findings = machine.processes(&config);
         assert_eq!(findings.len(), 2, "{findings:?}");
         assert!(findings.iter().all(|finding| finding.severity == Severity::Warning));
-        assert!(findings[0].found.contains("priorities up to 0, 70 wanted"), "{findings:?}");
+        assert!(findings[0].found.contains("priorities up to 0, 70 needed"), "{findings:?}");
         assert!(findings[0].remedy.starts_with("LimitRTPRIO=70 in the unit semidense-tracker@"));
         assert!(findings[1].found.contains("may lock 8 MB"), "{findings:?}");
     }

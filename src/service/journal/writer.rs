@@ -133,7 +133,7 @@ impl Writer {
                 let is_news = self.log_refusals.is_news(error.is_some());
                 error.filter(|_| is_news).map(|error| {
                     format!(
-                        "the journal is behind ({error}); a kill would now cost more than a second of the run"
+                        "the journal has fallen behind ({error}); a kill would now lose more than a second of the run"
                     )
                 })
             }
@@ -142,7 +142,7 @@ impl Writer {
                 let is_news = self.depth_refusals.is_news(error.is_some());
                 error.filter(|_| is_news).map(|error| {
                     format!(
-                        "the journal cannot take the depth of a keyframe ({error}); a kill would now cost depth of the map"
+                        "cannot write the depth of a keyframe to the journal ({error}); a kill would now lose depth of the map"
                     )
                 })
             }
@@ -285,7 +285,7 @@ mod tests {
             .flatten()
             .collect();
         assert_eq!(said.len(), 1, "{said:?}");
-        assert!(said[0].contains("the journal is behind"), "{said:?}");
+        assert!(said[0].contains("the journal has fallen behind"), "{said:?}");
         // Once the disk has room, the waiting records are written; after a while a full disk is reported again.
         writer.log = log;
         for n in 0..Refusals::CALM {

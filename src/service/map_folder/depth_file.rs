@@ -66,7 +66,7 @@ pub enum DepthFileError {
     #[error("it is not a keyframe of a map")]
     Magic,
     /// Another version wrote it.
-    #[error("it is of version {0}, and this program reads up to version {VERSION}")]
+    #[error("it has version {0}, but this program reads up to version {VERSION}")]
     Version(u32),
     /// It is cut short or too long.
     #[error("it has {found} bytes instead of {expected}")]
@@ -83,7 +83,7 @@ pub enum DepthFileError {
     #[error("it belongs to another keyframe")]
     Foreign,
     /// A number in its head is invalid.
-    #[error("{what} = {value} is not possible")]
+    #[error("invalid {what} = {value}")]
     Head {
         /// Which number.
         what: &'static str,

@@ -231,7 +231,7 @@ fn save_waiting(shared: &Shared, camera: &Intrinsics) {
     let failure = put.and_then(|()| writer.save(camera, head)).err().map(|error| error.to_string());
     tracing::debug!("saved {} keyframes in {:?}", keyframes.len(), begin.elapsed());
     if let Some(failure) = failure {
-        tracing::warn!("{failure}; the map on the disk is the one saved before");
+        tracing::warn!("{failure}; the previous save remains on disk");
         let mut waiting = locked(&shared.waiting);
         (waiting.has_failed, waiting.failure) = (true, Some(failure));
     }

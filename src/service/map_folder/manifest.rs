@@ -97,11 +97,11 @@ pub enum ManifestError {
     Magic,
     /// Another version wrote it.
     #[error(
-        "the map is of version {0}, and this program reads version {VERSION}: use the program that made it"
+        "the map has version {0}, but this program reads version {VERSION}: use the version of semidense that wrote it"
     )]
     Version(u32),
     /// It has a required section that is unknown to this program.
-    #[error("the map has a part `{0}` that this program does not know: use a newer one")]
+    #[error("unknown map section `{0}`: use a newer version of semidense")]
     Section(String),
     /// A bit is wrong, or a part is missing.
     #[error("it is damaged ({0})")]
@@ -163,7 +163,8 @@ impl Manifest {
         if version != VERSION {
             return Err(ManifestError::Version(version));
         }
-        let (body, checksum) = bytes.split_last_chunk::<4>().ok_or_else(|| damaged("it is cut"))?;
+        let (body, checksum) =
+            bytes.split_last_chunk::<4>().ok_or_else(|| damaged("it is truncated"))?;
         if crc32fast::hash(body) != u32::from_le_bytes(*checksum) {
             return Err(damaged("its checksum is wrong"));
         }
@@ -173,15 +174,16 @@ impl Manifest {
             let tag: [u8; 4] = take(&mut rest)?;
             let length = usize::try_from(take::<u64>(&mut rest)?).ok();
             let payload = length.and_then(|length| rest.split_off(..length));
-            let payload = payload.ok_or_else(|| damaged("a part is cut"))?;
+            let payload = payload.ok_or_else(|| damaged("a section is truncated"))?;
             let is_known = [CAMERA, STATE, KEYFRAMES, LOOPS].contains(&tag);
             if !is_known && !tag[0].is_ascii_lowercase() {
                 return Err(ManifestError::Section(tag.escape_ascii().to_string()));
             }
             sections.insert(tag, payload);
         }
-        let part =
-            |tag: [u8; 4]| sections.get(&tag).copied().ok_or_else(|| damaged("a part is missing"));
+        let part = |tag: [u8; 4]| {
+            sections.get(&tag).copied().ok_or_else(|| damaged("a section is missing"))
+        };
         let mut manifest = Self::new(camera_of(part(CAMERA)?)?, MapDetail::Full);
         manifest.read_state(part(STATE)?)?;
         manifest.read_keyframes(part(KEYFRAMES)?)?;
@@ -205,7 +207,7 @@ impl Manifest {
             && [self.revision, self.saves].iter().all(|number| *number <= MAX_REVISION);
         match is_possible && payload.is_empty() {
             true => Ok(()),
-            false => Err(damaged("its numbers are not possible")),
+            false => Err(damaged("invalid numbers")),
         }
     }
 
@@ -213,12 +215,12 @@ impl Manifest {
         let payload = &mut payload;
         let count = usize::try_from(take::<u64>(payload)?).unwrap_or(usize::MAX);
         if count > MAX_KEYFRAMES {
-            return Err(damaged("more keyframes than any map has"));
+            return Err(damaged("too many keyframes"));
         }
         for index in 0..count {
             let at = |what: &str| damaged(&format!("keyframe {index}: {what}"));
             let length = take::<u32>(payload)? as usize;
-            let head = payload.split_off(..length).ok_or_else(|| at("it is cut"))?;
+            let head = payload.split_off(..length).ok_or_else(|| at("it is truncated"))?;
             let keyframe = parse_keyframe(head).map_err(|error| at(&error.to_string()))?;
             let file: DepthFile = take(payload)?;
             let last = self.keyframes.last().map(|last| last.keyframe.keyframe_id);
@@ -231,7 +233,7 @@ impl Manifest {
                 && file.num_points as usize <= MAX_KEYFRAME_POINTS
                 && file.revision <= MAX_REVISION;
             if !is_possible {
-                return Err(at("its numbers are not possible"));
+                return Err(at("invalid numbers"));
             }
             let file = Some(file).filter(|file| file.bytes > 0);
             self.keyframes.push(Listed { keyframe, file });
@@ -258,7 +260,7 @@ fn push_section(bytes: &mut Vec<u8>, tag: [u8; 4], payload: &[u8]) {
 }
 
 fn take<T: FromBytes>(bytes: &mut &[u8]) -> Result<T, ManifestError> {
-    bytes::take(bytes).ok_or_else(|| damaged("it is cut"))
+    bytes::take(bytes).ok_or_else(|| damaged("it is truncated"))
 }
 
 fn camera_of(mut payload: &[u8]) -> Result<Intrinsics, ManifestError> {
@@ -266,7 +268,7 @@ fn camera_of(mut payload: &[u8]) -> Result<Intrinsics, ManifestError> {
     let [width, height] = take::<[u32; 2]>(payload)?.map(|pixels| pixels as usize);
     let [fx, fy, cx, cy] = take(payload)?;
     let camera = Intrinsics { fx, fy, cx, cy, width, height };
-    if camera.is_valid() { Ok(camera) } else { Err(damaged("its camera is not possible")) }
+    if camera.is_valid() { Ok(camera) } else { Err(damaged("invalid camera")) }
 }
 
 #[cfg(test)]

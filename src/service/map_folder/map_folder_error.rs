@@ -11,7 +11,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 pub enum MapFolderError {
     /// The folder holds no map.
     #[error(
-        "{0} holds no map: check the path, or begin one there with `semidense run SOURCE --map {0}`"
+        "{0} holds no map: check the path, or start one there with `semidense run SOURCE --map {0}`"
     )]
     Missing(PathBuf),
     /// The path is a file.
@@ -23,10 +23,10 @@ pub enum MapFolderError {
     )]
     Foreign(PathBuf),
     /// The folder holds a map that would be lost.
-    #[error("{0} holds a map already: name another folder")]
+    #[error("{0} already holds a map: name another folder")]
     Taken(PathBuf),
     /// The map has no keyframe yet.
-    #[error("there is no map yet: no keyframe has been made")]
+    #[error("there is no map yet: no keyframe has been created")]
     Empty,
     /// It cannot be read.
     #[error("{path}: {source}")]

@@ -79,7 +79,7 @@ pub fn read_manifest(folder: &Path) -> Result<(Manifest, Vec<String>), MapFolder
         return Err(error);
     }
     match read(BEFORE) {
-        Ok(manifest) => Ok((manifest, vec![format!("{error}: the map is the one saved before")])),
+        Ok(manifest) => Ok((manifest, vec![format!("{error}; using the previous save")])),
         Err(before) if is_missing(&before) && is_missing(&error) => {
             Err(MapFolderError::Missing(folder.to_owned()))
         }

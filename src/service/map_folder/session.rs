@@ -168,7 +168,7 @@ fn tell_what_is_missing(loaded: &Loaded, max_bytes: usize) {
     if loaded.without_memory > 0 {
         tracing::warn!(
             "{} of {} keyframes of the map are left without depth, so that the others take at most {} MB: raise \
-             mapping.max_map_megabytes to find the camera on them too",
+             mapping.max_map_megabytes to relocalise against them too",
             loaded.without_memory,
             loaded.map.keyframes.len(),
             max_bytes / MEGABYTE

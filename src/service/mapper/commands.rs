@@ -28,7 +28,7 @@ use crate::wire::command::Command;
 const LOADS_MAP: &str = "another map is being loaded";
 /// Pause between two signs of life meanwhile.
 const LOADING_PAUSE: Duration = Duration::from_millis(20);
-const NO_FRAME: &str = "there is no map yet: no frame has come";
+const NO_FRAME: &str = "there is no map yet: no frame has arrived";
 
 /// Outcome of a command; an error is returned to its sender.
 type Answer = Result<(), Box<dyn Error>>;
@@ -89,7 +89,7 @@ impl Shell<'_> {
         let Some((camera, mapper)) = &self.mapper else { return Err(NO_FRAME.into()) };
         let (camera, numbering) = (*camera, Numbering::above(mapper));
         if self.map.as_ref().is_some_and(|map| map.is_in(&folder)) {
-            return Err(format!("{} is the map that the mapper is in", folder.display()).into());
+            return Err(format!("the mapper already uses the map {}", folder.display()).into());
         }
         check_loadable(&folder, &camera).map_err(|error| match error {
             MapFolderError::Missing(_) => format!("{} holds no map", folder.display()),
@@ -107,7 +107,7 @@ impl Shell<'_> {
             next.take_the_place_of(before);
         }
         self.adjustments.orphan();
-        tracing::info!("the mapper goes over to the map {}", folder.display());
+        tracing::info!("the mapper switches to the map {}", folder.display());
         (self.map, self.mapper) = (Some(session), Some((camera, next)));
         Ok(())
     }
@@ -131,7 +131,7 @@ impl Shell<'_> {
             session.begin(&mut mapper, camera, None).map_err(|error| error.to_string())?;
             match mapper.situation() {
                 Situation::Localising(_) => Ok((session, mapper)),
-                _ => Err(format!("{}: no keyframe to find the camera on", map.folder)),
+                _ => Err(format!("{}: no keyframe to relocalise against", map.folder)),
             }
         };
         let health = &mut self.health;

@@ -34,13 +34,13 @@ impl GoneOver {
             Ok(()) => {}
             Err(error) if error.kind() == io::ErrorKind::NotFound => return None,
             Err(error) => {
-                tracing::warn!("{}: {error}; the map is the configured one", path.display());
+                tracing::warn!("{}: {error}; using the configured map", path.display());
                 return None;
             }
         }
         let read: Result<Self, _> = serde_json::from_slice(&bytes);
         let read = read.inspect_err(|error| {
-            tracing::warn!("{}: {error}; the map is the configured one", path.display());
+            tracing::warn!("{}: {error}; using the configured map", path.display());
         });
         read.ok().filter(|left| left.from == configured.folder)
     }

@@ -90,7 +90,7 @@ impl Output {
         };
         let (true, Some([_, images])) = (keyframe.has_depth(), &self.images) else {
             return Err(format!(
-                "keyframe {keyframe_id} keeps its pose only; its depth was given up for memory"
+                "keyframe {keyframe_id} has only its pose; its depth was dropped to save memory"
             ));
         };
         let sent = images

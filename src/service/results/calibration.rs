@@ -26,7 +26,7 @@ pub fn calibration_warning(whitened_residual_median: Option<f64>) -> Option<Stri
     let residual = whitened_residual_median.filter(|residual| *residual > DOUBTED_RESIDUAL)?;
     Some(format!(
         "the images fit the map badly (whitened residual {residual:.2}, 1 is expected): check that the rig belongs to this \
-         camera and image size; strong blur or a rolling shutter look the same"
+         camera and image size; strong blur or a rolling shutter has the same effect"
     ))
 }
 

@@ -18,7 +18,7 @@ pub fn evaluate_depth(
         let true_depth = match source.depth_at(keyframe.capture_nanos) {
             // One damaged file must not cost the results.
             Err(error) if error.is_passing() => {
-                tracing::warn!("a keyframe is not compared with its true depth: {error}");
+                tracing::warn!("skipping the depth comparison of a keyframe: {error}");
                 None
             }
             depth => depth?,

@@ -24,8 +24,8 @@ pub fn write_surface(path: &Path, surface: &[SurfacePoint]) -> io::Result<()> {
     write_atomically(path, |file| {
         write!(
             file,
-            "{BEGINNING} along the ray in map units, keyframes that agree; normal 0 0 0: not known\n\
-             comment any beginning of the list shows all of the map\n\
+            "{BEGINNING} along the ray in map units, keyframes that agree; normal 0 0 0: unknown\n\
+             comment any prefix of the list covers the whole map\n\
              element vertex {}\n{PROPERTIES}",
             surface.len()
         )?;

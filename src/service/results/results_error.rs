@@ -18,7 +18,7 @@ pub enum ResultsError {
     },
     /// There is not enough space.
     #[error(
-        "cannot write {path}: {source}; about {needed_mb} MB are needed and {free_mb} MB are free: make room, or choose another folder with --output"
+        "cannot write {path}: {source}; about {needed_mb} MB are needed and {free_mb} MB are free: free some space, or choose another folder with --output"
     )]
     Room {
         /// The file.

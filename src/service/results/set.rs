@@ -183,7 +183,7 @@ fn move_up(output: &Path) -> io::Result<()> {
             }
             // It appeared during the run. The results are worth more than the pictures.
             Some(file) => {
-                tracing::warn!("{}: no folder, so that no pictures are written", file.display());
+                tracing::warn!("{} is not a folder; no pictures are written", file.display());
                 fs::remove_dir_all(debug)?;
             }
         }

@@ -129,10 +129,10 @@ fn slowness(record: &RunRecord, frames_in: u64) -> Option<Slowness> {
 impl fmt::Display for Untracked {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
-            Self::NoFrame => f.write_str("the source gave no frame"),
+            Self::NoFrame => f.write_str("the source delivered no frame"),
             Self::FewFrames(frames) => write!(
                 f,
-                "{} {} too few: a map begins after the camera has moved sideways for some frames",
+                "{} {} too few: a map starts only after the camera has moved sideways for several frames",
                 counted(frames, "frame"),
                 if frames == 1 { "is" } else { "are" }
             ),
@@ -147,7 +147,7 @@ impl fmt::Display for Untracked {
             Self::LostAtOnce { began, reason, slowness } => {
                 write!(
                     f,
-                    "a map began at frame {began}, the tracker lost it at once: {}; ",
+                    "a map started at frame {began}, but the tracker lost it at once: {}; ",
                     loss_text(reason)
                 )?;
                 match slowness {
@@ -172,7 +172,7 @@ fn loss_text(reason: LostReason) -> &'static str {
 fn advice(seen: StartFrame) -> &'static str {
     match seen {
         StartFrame::Begun => {
-            "the start began anew again and again; move the camera sideways, smoothly and for longer"
+            "the start failed again and again; move the camera sideways, smoothly and for longer"
         }
         StartFrame::Dark => {
             "the images are dark and show no texture; add light or exposure, and check the lens cap"
@@ -256,8 +256,7 @@ pub(super) mod tests {
         let lost = TrackingState::Lost(LostReason::TooFewInliers);
         let text = |record: &RunRecord| Untracked::of(record).unwrap().to_string();
         let of_lost = text(&record(60, 60, lost));
-        let expected =
-            "a map began at frame 10, the tracker lost it at once: too few points matched; move";
+        let expected = "a map started at frame 10, but the tracker lost it at once: too few points matched; move";
         assert!(of_lost.starts_with(expected), "{of_lost}");
         let slow = text(&record(60, 20, lost));
         assert!(slow.contains("lost it at once") && slow.contains("40 of 60 frames"), "{slow}");

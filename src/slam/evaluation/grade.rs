@@ -92,10 +92,10 @@ impl Grade {
         findings.extend(losses(input));
         if input.epochs > 1 {
             let what = match input.are_poses_given {
-                true => "depth was begun anew for each",
-                false => "each with a scale of its own",
+                true => "depth was restarted in each",
+                false => "each with its own scale",
             };
-            let parts = format!("the map is in {} parts, {what}", input.epochs);
+            let parts = format!("the map has {} separate parts, {what}", input.epochs);
             findings.push((GradeLevel::Doubtful, parts));
         }
         if input.rejections > 0 {

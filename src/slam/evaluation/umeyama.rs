@@ -34,10 +34,10 @@ impl TrajectoryAlignment {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum AlignmentError {
     /// All positions of one trajectory are the same, so its scale is undefined.
-    #[error("the {0} stands still, so no scale can be found: align with se3 or none")]
+    #[error("the {0} does not move, so its scale is undefined: align with se3 or none")]
     StandsStill(&'static str),
     /// The best scale is not positive: one is not a similar copy of the other.
-    #[error("no positive scale brings the estimate to the ground truth: align with se3 or none")]
+    #[error("no positive scale aligns the estimate with the ground truth: align with se3 or none")]
     NoScale,
     /// The positions are so large that their products are not finite.
     #[error("positions too large to compare: check the units of both trajectories")]

@@ -51,7 +51,7 @@ pub struct Constraint {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum GraphError {
     /// The vertex is not a valid similarity.
-    #[error("the place of vertex {0} is not finite or its scale is not positive")]
+    #[error("the pose of vertex {0} is not finite or its scale is not positive")]
     InvalidVertex(usize),
     /// The graph already has the maximum number of vertices or constraints.
     #[error("a pose graph has at most {MAX_VERTICES} vertices and {MAX_CONSTRAINTS} constraints")]

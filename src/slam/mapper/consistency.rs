@@ -71,11 +71,11 @@ pub enum Contradiction {
 impl fmt::Display for Contradiction {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::FailedSearches => "frame after frame most searches for depth fail",
+            Self::FailedSearches => "most depth searches failed in consecutive frames",
             Self::LostDepth => "almost no depth is left",
             Self::ScaleJump => "the mean depth jumped from one keyframe to the next",
             Self::WrongStart => {
-                "frames on the first keyframes do not fit the depth that it began with"
+                "frames on the first keyframes do not fit the depth that the map started with"
             }
         })
     }

@@ -26,7 +26,7 @@ pub enum PriorError {
     #[error("keyframe {0} was taken with another camera")]
     Camera(u64),
     /// There is no keyframe with depth.
-    #[error("the map has no keyframe with depth to find the camera on")]
+    #[error("the map has no keyframe with depth to relocalise against")]
     Empty,
 }
 

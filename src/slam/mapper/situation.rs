@@ -85,13 +85,13 @@ impl fmt::Display for Situation {
             Self::Starting(progress) => write!(f, "starting: {progress}"),
             Self::Localising(keyframes) => {
                 let keyframes = counted(*keyframes, "keyframe");
-                write!(f, "localising: looking for the camera on {keyframes} of the map")
+                write!(f, "localising: searching {keyframes} of the map for the camera")
             }
             Self::Localised(certainty) => write!(f, "localised in the map: {certainty}"),
             Self::Mapping => f.write_str("mapping"),
-            Self::Lost => f.write_str("lost: looking for the camera on recent keyframes"),
+            Self::Lost => f.write_str("lost: searching keyframes for the camera"),
             Self::Rejected(why) => write!(f, "map rejected: {why}"),
-            Self::Restarting(progress) => write!(f, "lost: beginning a new epoch, {progress}"),
+            Self::Restarting(progress) => write!(f, "lost: starting a new epoch, {progress}"),
         }
     }
 }
@@ -181,7 +181,7 @@ impl fmt::Display for StartProgress {
         f.write_str(match self.waiting {
             None => "waiting for a frame",
             Some(Waiting::Texture) => "waiting for texture",
-            Some(Waiting::Match) => "waiting for a frame that shows what the first one does",
+            Some(Waiting::Match) => "waiting for a frame that shows the same scene as the first",
             Some(Waiting::Significance) => "waiting for parallax: a rotation explains the images",
             Some(Waiting::NegativeDepth) => "waiting for parallax: depths are contradictory",
             Some(Waiting::Rival) => "waiting for parallax: two motions explain the images",
@@ -191,11 +191,11 @@ impl fmt::Display for StartProgress {
         })?;
         let why = match self.last_failure {
             None => return Ok(()),
-            Some(Failure::TooLong) => "too many frames without proof",
+            Some(Failure::TooLong) => "too many frames passed without proof",
             Some(Failure::Mismatch) => "the view changed too much",
-            Some(Failure::WrongSize) => "a frame of another size",
+            Some(Failure::WrongSize) => "a frame had another size",
         };
-        write!(f, "; begun again {}, the last for {why}", counted(self.failures, "time"))
+        write!(f, "; restarted {}, last because {why}", counted(self.failures, "time"))
     }
 }
 
@@ -211,8 +211,10 @@ mod tests {
         progress.observe(InitState::Failed(Failure::TooLong));
         progress.observe(InitState::Waiting(Waiting::Texture));
         let text = Situation::Restarting(progress).to_string();
-        assert!(text.starts_with("lost: beginning a new epoch, waiting for texture"), "{text}");
-        assert!(text.ends_with("begun again 1 time, the last for too many frames without proof"));
+        assert!(text.starts_with("lost: starting a new epoch, waiting for texture"), "{text}");
+        assert!(
+            text.ends_with("restarted 1 time, last because too many frames passed without proof")
+        );
         progress.observe(InitState::Proven);
         assert_eq!(progress, StartProgress::default());
     }

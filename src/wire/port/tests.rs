@@ -111,7 +111,7 @@ fn a_reader_that_finds_the_topic_full_is_told_its_subscribers() {
         assert!(!error.is_absence(), "it runs: {error}");
         let text = error.to_string();
         let begin = format!(
-            "topic rig/v{WIRE_VERSION}/mapper/keyframe has its 6 subscribers: stop one of view-"
+            "topic rig/v{WIRE_VERSION}/mapper/keyframe already has its maximum of 6 subscribers: stop one of view-"
         );
         assert!(text.starts_with(&begin), "{text}");
         let own = format!("view-5 (process {})", std::process::id());

@@ -4,17 +4,17 @@ mod environment;
 
 use environment::{CONFIGURATION, LIMITS, OUTPUT, TRAJECTORIES};
 
-/// One thing that is tried.
+/// One bad input.
 pub struct Row {
-    /// In words.
+    /// Description in words.
     pub tried: &'static str,
-    /// What breaks the folder, in the shell.
+    /// Shell commands that damage the folder.
     pub setup: &'static str,
     /// The command line, in the shell.
     pub command: &'static str,
     /// The exit code.
     pub code: i32,
-    /// What must be said.
+    /// Words that the output must contain.
     pub words: &'static [&'static str],
 }
 
@@ -29,10 +29,10 @@ pub struct Section {
 pub const INTRODUCTION: &str = "\
 # Bad inputs
 
-The messages of semidense for wrong inputs, and its exit code: 0 done (it says what was left out), 1 failed, 2 wrong \
-command line, 3 nothing was tracked, 130 stopped by Ctrl-C. Every row is run by `tests/files/bad_input.rs`, which fails when the \
-program says anything else than this page; `SEMIDENSE_WRITE_DOCS=1 cargo test --release --test files bad_input` writes the page. `recording` is a folder \
-in TUM layout with twenty images of 160x120 pixels, `rig.toml` its camera, `…` the folder where the command runs, N a number \
+The messages that semidense prints for invalid inputs, with its exit codes: 0 done (the message names what was left out), 1 failed, \
+2 wrong command line, 3 nothing was tracked, 130 stopped by Ctrl-C. `tests/files/bad_input.rs` runs every row and fails if the \
+program prints anything else; `SEMIDENSE_WRITE_DOCS=1 cargo test --release --test files bad_input` writes the page. `recording` is a folder \
+in TUM layout with twenty images of 160x120 pixels, `rig.toml` the calibration of its camera, `…` the folder where the command runs, N a number \
 that depends on the machine.
 ";
 
@@ -60,7 +60,7 @@ pub const SECTIONS: &[Section] = &[
 
 const SOURCES: &[Row] = &[
     row(
-        "a folder that is not there",
+        "a missing folder",
         "",
         "semidense run nowhere",
         1,
@@ -73,13 +73,13 @@ const SOURCES: &[Row] = &[
         1,
         &["no such file or folder: 0; a camera is named v4l:0"],
     ),
-    row("the same with its layout", "", "semidense replay tum:nowhere", 1, &["no folder nowhere"]),
-    row("a kind that is not known", "", "semidense run ros:topic", 1, &["unknown kind"]),
+    row("the same with a layout", "", "semidense replay tum:nowhere", 1, &["no folder nowhere"]),
+    row("an unknown kind", "", "semidense run ros:topic", 1, &["unknown kind"]),
     row("no folder after the kind", "", "semidense run euroc:", 1, &["the folder is missing"]),
-    row("a scene that is not known", "", "semidense run sim:moon", 1, &["sim:moon"]),
+    row("an unknown scene", "", "semidense run sim:moon", 1, &["sim:moon"]),
     row("an empty folder", "mkdir empty", "semidense run empty", 1, &["it is empty", "rgb.txt"]),
     row(
-        "a folder with something else",
+        "a folder with other files",
         "mkdir other; touch other/a.txt other/b.bin",
         "semidense replay other",
         1,
@@ -92,13 +92,19 @@ const SOURCES: &[Row] = &[
         1,
         &["there is a recording in it: tum:outer/recording"],
     ),
-    row("another layout than named", "", "semidense run euroc:recording", 1, &["looks like tum:"]),
+    row(
+        "a layout other than the one named",
+        "",
+        "semidense run euroc:recording",
+        1,
+        &["looks like tum:"],
+    ),
     row(
         "a video",
         "touch walk.mp4",
         "semidense run walk.mp4",
         1,
-        &["by its name this is a video", "<br>mkdir 'walk.frames' && ffmpeg -i 'walk.mp4'"],
+        &["this looks like a video file", "<br>mkdir 'walk.frames' && ffmpeg -i 'walk.mp4'"],
     ),
     row("an archive", "touch a.zip", "semidense replay a.zip", 1, &["unpack it"]),
     row("a ROS bag", "touch a.bag", "semidense replay a.bag", 1, &["convert it to MCAP"]),
@@ -115,7 +121,7 @@ const SOURCES: &[Row] = &[
 
 const IMAGES: &[Row] = &[
     row(
-        "one image cut short",
+        "one truncated image",
         "halve $(image 3)",
         "semidense replay recording --output out",
         0,
@@ -129,21 +135,21 @@ const IMAGES: &[Row] = &[
         &["damaged PNG"],
     ),
     row(
-        "one image missing",
+        "one missing image",
         "rm $(image 2)",
         "semidense replay recording --output out",
         0,
         &["1 of 20 images"],
     ),
     row(
-        "one image empty",
+        "one empty image",
         "truncate -s 0 $(image 2)",
         "semidense run recording --output out",
         0,
         &["is empty"],
     ),
     row(
-        "one image is text",
+        "one image that is text",
         "echo hello > $(image 2)",
         "semidense run recording --output out",
         0,
@@ -154,59 +160,59 @@ const IMAGES: &[Row] = &[
         "semidense simulate --frames 1 --width 32 --height 32 --output small; cp small/rgb/*.png $(image 4)",
         "semidense run recording --output out",
         0,
-        &["is 32x32 pixels where the rig says 160x120"],
+        &["is 32x32 pixels, but the rig expects 160x120"],
     ),
     row(
-        "a folder named as an image",
+        "a folder in place of an image",
         "i=$(image 5); rm $i; mkdir $i",
         "semidense run recording --output out",
         0,
         &["it is a folder"],
     ),
     row(
-        "a pipe named as an image",
+        "a pipe in place of an image",
         "i=$(image 5); rm $i; mkfifo $i",
         "semidense run recording --output out",
         0,
         &["a named pipe"],
     ),
     row(
-        "a device named as an image",
+        "a device in place of an image",
         "ln -sf /dev/zero $(image 1)",
         "semidense run recording --output out",
         0,
         &["a device"],
     ),
     row(
-        "a link that leads nowhere",
+        "a dangling link",
         "ln -sf none $(image 1)",
         "semidense run recording --output out",
         0,
         &["No such file"],
     ),
     row(
-        "half of the images cut short",
+        "half of the images truncated",
         "for i in $(seq 1 2 20); do halve $(image $i); done",
         "semidense replay recording --output out",
         0,
         &["10 of 20 images"],
     ),
     row(
-        "a bad image, strictly",
+        "a damaged image, with --strict",
         "halve $(image 3)",
         "semidense replay --strict recording",
         1,
         &["damaged PNG"],
     ),
     row(
-        "the same in three processes, strictly",
+        "a missing image in three processes, with --strict",
         "rm $(image 3)",
         "semidense run --strict recording",
         1,
         &["No such file"],
     ),
     row(
-        "no good image",
+        "no usable image",
         "truncate -s 0 recording/rgb/*",
         "semidense run recording",
         1,
@@ -230,7 +236,7 @@ const LISTS: &[Row] = &[
         &["has no frames"],
     ),
     row(
-        "stamps that go back",
+        "stamps that go backwards",
         "change recording/rgb.txt '4{h;d};5{p;x}'",
         "semidense replay recording",
         1,
@@ -279,7 +285,7 @@ const LISTS: &[Row] = &[
         &["a folder"],
     ),
     row(
-        "a list that never ends",
+        "an endless list (device)",
         "ln -sf /dev/zero recording/rgb.txt",
         "semidense replay tum:recording",
         1,
@@ -311,7 +317,7 @@ const LISTS: &[Row] = &[
 const RIGS: &[Row] = &[
     row("no calibration", "rm recording/camera.txt", "semidense run recording", 1, &["--rig FILE"]),
     row(
-        "a rig that is not there",
+        "a missing rig",
         "",
         "semidense run recording --rig none.toml",
         1,
@@ -319,21 +325,21 @@ const RIGS: &[Row] = &[
     ),
     row("a rig that is a folder", "", "semidense run recording --rig recording", 1, &["a folder"]),
     row(
-        "a rig that never ends",
+        "an endless rig (device)",
         "",
         "semidense replay recording --rig /dev/zero",
         1,
         &["a device"],
     ),
     row(
-        "a key that is not known",
+        "an unknown key",
         "echo 'lens = 3' >> rig.toml",
         "semidense run recording --rig rig.toml",
         1,
         &["unknown field `lens`"],
     ),
     row(
-        "something that is not a number",
+        "a value that is not a number",
         "echo 'nan 131 79.5 59.5 160 120' > recording/camera.txt",
         "semidense run recording",
         1,
@@ -347,14 +353,14 @@ const RIGS: &[Row] = &[
         &["cx = 999", "0 to 159"],
     ),
     row(
-        "a field of view that no such lens has",
+        "a field of view that is impossible for the lens",
         "change rig.toml 's/fx = .*/fx = 3/'",
         "semidense run recording --rig rig.toml",
         1,
         &["fx = 3", "field of view"],
     ),
     row(
-        "a field of view that is unusual",
+        "an unusual field of view",
         "change rig.toml 's/f\\([xy]\\) = .*/f\\1 = 2000/'; rm recording/camera.txt",
         "semidense replay recording --rig rig.toml --output out",
         3,
@@ -394,7 +400,7 @@ const CAMERAS: &[Row] = &[
         &["cannot be repeated"],
     ),
     row(
-        "a camera that is not there, until Ctrl-C",
+        "a missing camera, until Ctrl-C",
         "",
         "until_said waiting semidense run v4l:/dev/video99 --rig rig.toml --output out",
         130,

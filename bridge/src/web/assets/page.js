@@ -40,7 +40,7 @@ function connect() {
   };
   socket.onclose = () => {
     setLink("gone", "no connection");
-    if (!seen.run) showMessage("No connection", "The server is not there. This page connects by itself.");
+    if (!seen.run) showMessage("No connection", "The server cannot be reached. This page reconnects automatically.");
     setTimeout(connect, RETRY_MS[Math.min(tries++, RETRY_MS.length - 1)]);
   };
 }
@@ -67,10 +67,10 @@ const handlers = {
     seen.joined = m.joined; seen.known = m.keyframes; seen.note = m.note;
     if (m.active !== null) viewer.setActive(m.active);
     setLink(m.joined ? "live" : "waiting", m.joined ? "live" : m.run ? "run has ended" : "waiting for a run");
-    if (!m.joined && m.run === 0) showMessage("Waiting for a run", `No instance "${seen.instance}" is there yet. Start one with semidense run.`);
+    if (!m.joined && m.run === 0) showMessage("Waiting for a run", `No instance "${seen.instance}" is running yet. Start one with semidense run.`);
     else if (m.joined && !seen.pose) showMessage("Waiting for the first frame", "The processes are starting.");
     $("save").disabled = !m.joined;
-    if (!m.joined) showState(m.run ? "ended" : "waiting", m.run ? "the map stays until the next run begins" : "for a run to begin", "none");
+    if (!m.joined) showState(m.run ? "ended" : "waiting", m.run ? "the map remains until the next run begins" : "for a run to begin", "none");
     figures();
   },
   health(m) { for (const p of m.processes) seen.health[p.process] = p; processes(); },
@@ -122,7 +122,7 @@ const handlers = {
 };
 
 function cameraNote(m) {
-  $("camera-note").textContent = overlay.shown ? `frame ${m.sequence}: ${grouped(overlay.shown)} points of keyframe ${overlay.shownKeyframe}, brought here by the pose` : `frame ${m.sequence}`;
+  $("camera-note").textContent = overlay.shown ? `frame ${m.sequence}: ${grouped(overlay.shown)} points of keyframe ${overlay.shownKeyframe}, projected with the pose` : `frame ${m.sequence}`;
 }
 
 // ---- words and figures ------------------------------------------------------------------------------------------
@@ -176,7 +176,7 @@ function figures() {
   list([
     ["keyframes", `${grouped(seen.known || 0)}${hidden ? `, ${hidden} of other epochs hidden` : ""}`],
     ["points", short(viewer.totalPoints)],
-    missing > 0 && ["depth not here yet", `${missing} keyframes`],
+    missing > 0 && ["depth still missing", `${missing} keyframes`],
     p && ["epoch, map revision", `${p.epoch}, ${p.map_revision}`],
     m && ["loops closed, held", `${m.loops.closed}, ${m.loops.held} of ${m.loops.searched} searches`],
     m && ["joint estimates", `${grouped(m.adjustments)}, ${m.adjustments_dropped} dropped`],
@@ -276,7 +276,7 @@ function start() {
     legend();
     $("drawn").textContent = `${short(viewer.drawn)} of ${short(viewer.totalPoints)} points${viewer.fps && !viewer.isStill ? `, ${Math.round(viewer.fps)} frames/s` : ""}`;
     // Poses that stay away are no pose that holds.
-    if (seen.joined && seen.pose && performance.now() - seen.lastPose > 3000) showState("no new poses", "for some seconds: the source pauses, or a process does not answer", "none");
+    if (seen.joined && seen.pose && performance.now() - seen.lastPose > 3000) showState("no new poses", "for some seconds: the source is paused, or a process does not respond", "none");
   }, 400);
   // For tests and the curious.
   window.stat = { get: () => ({ lit: viewer.litPixels(), points: viewer.totalPoints, drawn: viewer.drawn, fps: viewer.fps, poses: seen.poses, keyframes: viewer.clusters.size, frames: overlay.images, overlay: overlay.shown || 0,

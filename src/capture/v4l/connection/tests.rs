@@ -161,7 +161,7 @@ fn every_failure_is_a_state_with_its_reason() {
         (Errno::BUSY, "in use by another program, which `fuser /dev/video0` names"),
         (Errno::ACCESS, "usermod -aG video"),
         (Errno::NOSPC, "no bandwidth"),
-        (Errno::NOMEM, "its driver refuses ("),
+        (Errno::NOMEM, "its driver refused the request ("),
     ] {
         let fake = Fake::default();
         fake.refuse_opening(Some(OpenFailure::Refused("/dev/video0".into(), error)));
@@ -183,7 +183,7 @@ fn an_unusable_camera_is_an_error_unless_it_has_streamed() {
     assert!(error.contains("--rig"), "{error}");
     fake.refuse_opening(Some(OpenFailure::Ambiguous(vec!["a".into(), "b".into()])));
     let error = camera(&fake).await_frame(None, 10).unwrap_err();
-    assert_eq!(error, "0 may be a or b; name one of them");
+    assert_eq!(error, "0 is ambiguous: it may be a or b; name one of them");
     // After reconnection it may be a different device for a moment.
     let fake = Fake::default();
     let mut served = camera(&fake);
@@ -193,7 +193,7 @@ fn an_unusable_camera_is_an_error_unless_it_has_streamed() {
     fake.set_capability_flags(0);
     for _ in 0..20 {
         let reason = look(&mut served).unwrap_err();
-        assert!(reason.contains("no pictures") || reason.contains("unplugged"), "{reason}");
+        assert!(reason.contains("no images") || reason.contains("unplugged"), "{reason}");
     }
 }
 
@@ -209,7 +209,7 @@ fn a_camera_that_falls_silent_is_reopened() {
             break;
         }
     }
-    assert_eq!(reason.as_deref(), Some("/dev/video0: gives no frame for 2 s"));
+    assert_eq!(reason.as_deref(), Some("/dev/video0: has delivered no frame for 2 s"));
     come_back(&mut camera);
     assert_eq!((take(&fake, &mut camera, 0), fake.opened()), (2, 2));
 }
@@ -235,7 +235,7 @@ fn a_buffer_that_is_refused_once_is_enqueued_again() {
             Err(reason) => reasons.push(reason),
         }
     }
-    assert!(reasons[0].contains("its driver refuses ("), "{reasons:?}");
+    assert!(reasons[0].contains("its driver refused the request ("), "{reasons:?}");
 }
 
 #[test]

@@ -119,20 +119,20 @@ const CAUSES: &[(&str, &str, Format)] = &[
 
 /// Figures that need no ground truth.
 pub(super) const RUN_WORDS: &[Words] = words! {
-    mode: Run, Format::Text, "Mode", "Replay and lockstep take every frame; live takes the newest and leaves out what it has no time for.";
+    mode: Run, Format::Text, "Mode", "Replay and lockstep take every frame; live takes the newest and skips those that it has no time for.";
     source: Run, Format::Text, "Source", "Where the frames came from.";
     camera: Run, Format::Camera, "Camera", "Focal lengths, principal point and size of the rectified images, pixels.";
     ended: Run, Format::Text, "End", "Finished, interrupted, failed, or recovered from the journal of a run that was killed.";
     failure: Run, Format::Text, "Failure", "What ended the run.";
     recovered_run_end: Run, Format::Text, "End of the recovered run", "When the run ended from whose journal this was recovered (UTC).";
     grade: Run, Format::Drawn, "Grade", "At the head of the page.";
-    frames_in: Run, Format::Count, "Frames", "Frames that the source gave.";
+    frames_in: Run, Format::Count, "Frames", "Frames that the source delivered.";
     frames_refused: Run, Format::Count, "Images refused", "Images of the source that could not be used. 0 is good.";
     refused: Run, Format::Text, "What was refused", "The first image that could not be used, and what is wrong with it.";
     gaps: Run, Format::Count, "Gaps", "Holes in the source's numbering of frames. 0 is good.";
-    restarts: Run, Format::Count, "Restarts", "Processes that were started again after they had ended. 0 is good.";
-    restarts_by_process: Run, Format::Counts, "Restarts of each process", "How often each process was started again.";
-    restart_causes: Run, Format::Rows(CAUSES), "Causes of restarts", "What had ended the processes that were started again.";
+    restarts: Run, Format::Count, "Restarts", "Processes that were restarted after they had ended. 0 is good.";
+    restarts_by_process: Run, Format::Counts, "Restarts of each process", "How often each process was restarted.";
+    restart_causes: Run, Format::Rows(CAUSES), "Causes of restarts", "Why the restarted processes had ended.";
     recorded_secs: Run, Format::Unit("s"), "Recorded duration", "From the first stamp to the last.";
     wall_secs: Run, Format::Unit("s"), "Duration of the run", "Time from start to end of the run.";
     realtime_factor: Run, Format::Unit("× real time"), "Speed", "Recorded duration over that of the run. A replay may be faster than 1; a live run is 1.";
@@ -143,54 +143,54 @@ pub(super) const RUN_WORDS: &[Words] = words! {
     frames_initializing: Tracking, Format::Count, "Frames before the map", "Frames without a pose because the map could not be trusted yet.";
     frames_lost: Tracking, Format::Count, "Frames lost", "Frames without a pose because tracking was lost. 0 is good.";
     lost_count: Tracking, Format::Count, "Losses", "How often tracking was lost. 0 is good.";
-    frames_dropped: Tracking, Format::Count, "Frames dropped", "Frames that the tracker never saw because newer ones had come. 0 is good.";
-    frames_skipped_by_mapper: Tracking, Format::Count, "Frames not mapped", "Frames with a pose that the mapper left out because newer ones had come. Their poses are not affected.";
+    frames_dropped: Tracking, Format::Count, "Frames dropped", "Frames that the tracker never saw because newer ones had arrived. 0 is good.";
+    frames_skipped_by_mapper: Tracking, Format::Count, "Frames not mapped", "Frames with a pose that the mapper left out because newer ones had arrived. Their poses are not affected.";
     deadline_misses: Tracking, Format::Count, "Deadline misses", "Frames published later than the tracker's deadline. 0 is good.";
     initialization_secs: Tracking, Format::Unit("s"), "Time to the first pose", "From the first frame to the first whose pose is claimed.";
     untracked: Tracking, Format::Text, "Why nothing was tracked", "The most likely reason.";
     whitened_residual_median: Tracking, Format::Number, "Residual over its standard deviation", "Median over the tracked frames: 1 is as modelled; above 1.4 the calibration is doubtful.";
 
-    keyframes: Map, Format::Count, "Keyframes", "Frames of the final map that have depth of their own.";
+    keyframes: Map, Format::Count, "Keyframes", "Frames of the final map that have their own depth.";
     keyframes_without_depth: Map, Format::Count, "Keyframes without depth", "Those whose depth is no longer held: the oldest of a long run.";
-    points: Map, Format::Count, "Points of the keyframes", "Points of all keyframes that are known well enough.";
-    map_points: Map, Format::Count, "Points of the map", "Points of the surface that they are fused to: those of map.ply.";
-    epoch: Map, Format::Count, "Last epoch", "Life of the map at the end, counted from 0: a map that is lost for good is begun anew.";
-    epochs: Map, Format::Count, "Epochs with poses", "Each has a frame and a scale of its own. 1 is good.";
-    map_rejections: Map, Format::Rows(REJECTIONS), "Rejected maps", "Times that the map was found to contradict itself, and was begun anew.";
+    points: Map, Format::Count, "Points of the keyframes", "Points of all keyframes that are certain enough.";
+    map_points: Map, Format::Count, "Points of the map", "Points of the surface that they are fused into: those of map.ply.";
+    epoch: Map, Format::Count, "Last epoch", "Epoch of the map at the end, counted from 0: a map that is lost for good is restarted.";
+    epochs: Map, Format::Count, "Epochs with poses", "Each has its own coordinate frame and scale. 1 is good.";
+    map_rejections: Map, Format::Rows(REJECTIONS), "Rejected maps", "How often the map was found to contradict itself and was restarted.";
 
     adjustments: Joint, Format::Count, "Joint estimates", "Estimates of several keyframes together that entered the map.";
     adjustments_merged: Joint, Format::Count, "Of them merged", "Those that entered a map with newer keyframes, which followed.";
     adjustments_dropped: Joint, Format::Count, "Dropped", "Estimates that were dropped because the map had changed meanwhile. Few is good.";
-    adjustment_ms: Joint, Format::Times, "CPU time of an estimate", "Runs beside tracking and mapping.";
+    adjustment_ms: Joint, Format::Times, "CPU time of an estimate", "Runs alongside tracking and mapping.";
     adjustment_frames_max: Joint, Format::Count, "Longest delay", "Most frames between a keyframe and the entry of its estimate.";
     adjustment_inlier_ratio_median: Joint, Format::Percent, "Inliers", "Comparisons of a point with a keyframe that agree, median of the estimates. Above 80 % is good.";
     adjustment_rms_grey_median: Joint, Format::Unit("grey levels"), "Residual", "Difference in brightness that is left, root mean square, median of the estimates. A few levels are the camera's noise.";
 
-    loop_searches: Loops, Format::Count, "Searches", "Keyframes that were looked for in older ones.";
+    loop_searches: Loops, Format::Count, "Searches", "Keyframes that were searched for in older ones.";
     loop_pairs: Loops, Format::Count, "Pairs compared", "Pairs of keyframes that were compared.";
-    loops_closed: Loops, Format::Count, "Loops closed", "Places that were recognised and moved the map.";
-    loops_held: Loops, Format::Count, "Loops held already", "Places that were recognised where the map already had them: it had not drifted.";
+    loops_closed: Loops, Format::Count, "Loops closed", "Recognised places that corrected the map.";
+    loops_held: Loops, Format::Count, "Loops held already", "Recognised places that the map already satisfied: it had not drifted.";
     epochs_joined: Loops, Format::Count, "Epochs joined", "Maps that were joined to an older one.";
     loops_against_drift: Loops, Format::Count, "Against the drift", "Places that look alike but are further apart than the map can have drifted.";
     loops_unconfirmed: Loops, Format::Count, "Not confirmed", "Places that no second pair of keyframes confirmed.";
     loops_inconsistent: Loops, Format::Count, "Inconsistent", "Places that contradicted other loops.";
     loops_refused: Loops, Format::Count, "Other places", "Keyframes whose candidates turned out to be other places.";
-    loop_search_ms: Loops, Format::Times, "CPU time of a search", "Runs beside tracking and mapping.";
+    loop_search_ms: Loops, Format::Times, "CPU time of a search", "Runs alongside tracking and mapping.";
     loop_search_ms_per_keyframe: Loops, Format::Unit("ms"), "CPU time of searches for each keyframe", "All searches over the keyframes of the map.";
 
-    send_ms: Time, Format::Times, "From stamp to sending", "What is late before the tracker's deadline begins.";
+    send_ms: Time, Format::Times, "From stamp to sending", "Delay before the tracker's deadline starts.";
     latency_ms: Time, Format::Times, "Latency", "From a frame's stamp to the publication of its pose.";
     wake_ms: Time, Format::Times, "Wake-up time", "From a frame's sending until the tracker looks at it.";
     latency_histogram: Time, Format::Histogram, "Latencies", "How many frames were that late.";
-    track_histogram: Time, Format::Histogram, "Times in the tracker", "How many frames took so long.";
-    wake_histogram: Time, Format::Histogram, "Wake-up times", "How many frames waited so long.";
+    track_histogram: Time, Format::Histogram, "Times in the tracker", "How many frames took that long.";
+    wake_histogram: Time, Format::Histogram, "Wake-up times", "How many frames waited that long.";
     deadline_ms: Time, Format::Unit("ms"), "Deadline", "Time that the tracker was allowed for a frame.";
     track_ms: Time, Format::Times, "Tracking a frame", "Time in the tracker. Good is well below the interval between frames.";
     pyramid_ms: Time, Format::Times, "Image pyramid", "Part of the tracking time: from the frame to the first iteration.";
     alignment_levels: Time, Format::Rows(LEVELS), "Alignment by pyramid level", "What the alignment of a frame costs on each level of the image pyramid.";
     map_ms: Time, Format::Times, "Mapping a frame", "Time in the mapper.";
     keyframe_step_ms: Time, Format::Times, "Mapping a frame that becomes a keyframe", "The longest steps of the mapper.";
-    keyframe_ms: Time, Format::Times, "Until a new keyframe can be used", "Part of it: from the frame to a keyframe that the tracker can have.";
+    keyframe_ms: Time, Format::Times, "Until a new keyframe can be used", "Part of it: from the frame to a keyframe that the tracker can use.";
     fusion_secs: Time, Format::Unit("s"), "Fusing the map", "Time after the run to fuse the keyframes' points.";
     budget_curve: Time, Format::Drawn, "Quality and budget", "In the charts above.";
     page_faults: Time, Format::Count, "Page faults", "Of the tracker's frame loop after its first hundred frames: each can cost a deadline. 0 is good.";

@@ -13,7 +13,7 @@ pub(super) const QUALITY_WORDS: &[Words] = words! {
     ate_mean_m: Accuracy, Format::Metres, "Position error, mean", "The same, mean.";
     ate_median_m: Accuracy, Format::Metres, "Position error, median", "The same: half of the frames are better.";
     ate_max_m: Accuracy, Format::Metres, "Position error, largest", "The same, of the worst frame.";
-    ate_scale: Accuracy, Format::Unit("m"), "Map unit", "Length of a map unit by the alignment: a single camera does not know it.";
+    ate_scale: Accuracy, Format::Unit("m"), "Map unit", "Length of a map unit by the alignment: a single camera cannot determine it.";
     rpe_translation: Accuracy, Format::Metres, "Relative error of position, frame to frame", "Error of the movement from one frame to the next, root mean square.";
     rpe_rotation_deg: Accuracy, Format::Unit("°"), "Relative error of rotation, frame to frame", "Error of the turn from one frame to the next, root mean square.";
     rpe_translation_1s: Accuracy, Format::Metres, "Relative error of position over 1 s", "Error of the movement within a second, root mean square: the drift.";

@@ -18,7 +18,7 @@ const HISTOGRAM_ROWS: usize = 40;
 pub fn figures(summary: &Summary) -> String {
     let value = serde_json::to_value(summary).unwrap_or_default();
     let mut html = String::from(
-        "<section><h2>Figures</h2><p><code>summary.json</code> beside this page has the same for programs.</p>",
+        "<section><h2>Figures</h2><p><code>summary.json</code> next to this page holds the same figures for programs.</p>",
     );
     let shown = placed_figures(&value);
     for (group, heading) in GROUPS {

@@ -13,10 +13,10 @@ use crate::slam::evaluation::statistics::median;
 
 const RESIDUAL_MEANING: &str = "Difference in brightness between the keyframes after they are estimated together: a few \
                                 grey levels are the camera's noise; a rise means that the map does not fit the images.";
-const INLIER_MEANING: &str = "Comparisons of a point with a keyframe that agree. Above 80 % is good; low values are moving things, hidden points or \
+const INLIER_MEANING: &str = "Comparisons of a point with a keyframe that agree. Above 80 % is good; low values indicate moving objects, hidden points or \
      wrong depth.";
 const TIME_MEANING: &str =
-    "CPU time of each joint estimate of keyframes; it runs beside tracking and mapping.";
+    "CPU time of each joint estimate of keyframes; it runs alongside tracking and mapping.";
 
 /// Residual, share of inliers and time of every joint estimate; empty without any.
 pub fn joint_charts(record: &RunRecord) -> Vec<Chart> {

@@ -41,7 +41,7 @@ pub fn loop_section(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
             .collect();
         let _ = write!(
             section,
-            "<p>Other places, by what the first candidate lacks: {}.</p>",
+            "<p>Other places, by the reason against the first candidate: {}.</p>",
             listed.join("; ")
         );
     }
@@ -99,8 +99,8 @@ fn seen_from_above(
         keyframes.iter().map(|pose| views.seen_from_above(&pose.world_from_camera.translation));
     Chart {
         title: "Loops from above",
-        meaning: "Where earlier places were recognised. Closed or joined: the map was moved by it; held already: the map had it \
-                  so; against the drift and other place: refused.",
+        meaning: "Where earlier places were recognised. Closed or joined: the map was corrected; held already: the map already \
+                  satisfied it; against the drift and other place: refused.",
         x_label: "along the longest extent of the path [map units]".into(),
         y_label: "across [map units]".into(),
         height: 480.0,

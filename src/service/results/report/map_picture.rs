@@ -58,7 +58,7 @@ pub fn map_section(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
     let metres = results.evaluation.as_ref().filter(|_| unit != "m").map(|of| of.alignment.scale);
     let about_up = match up {
         Some(_) => "up is estimated from how the camera was held and from horizontal surfaces",
-        None => "what is up is not known: the view is along the path's shortest extent",
+        None => "the up direction is unknown: the view is along the path's shortest extent",
     };
     format!(
         "<section><h2>Map from above</h2><figure><div class=\"map\"><img alt=\"map from above\" src=\"{}\">{}</div>\

@@ -59,7 +59,7 @@ pub fn map_view(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
     html.push_str(include_str!("map_view.html"));
     let _ = write!(
         html,
-        "<p>{} of {} points; drag to turn, wheel or two fingers to zoom, shift-drag to move, double click for all of it. \
+        "<p>{} of {} points; drag to turn, wheel or two fingers to zoom, shift-drag to move, double click to show all of it. \
          Blue: the camera's path; the slider shows the map as it grew. Lengths are map units. \
          <code>semidense view</code> with this folder shows all points.</p>",
         grouped(shown as u64),

@@ -65,7 +65,7 @@ pub enum Refusal {
     #[error("the initial similarity is not finite or its scale is not positive")]
     InvalidStart,
     /// No start makes the images agree.
-    #[error("the images have nothing in common")]
+    #[error("the images do not overlap")]
     NothingAlike,
     /// No point falls into the other image.
     #[error("no point falls into the other image")]
@@ -98,10 +98,10 @@ pub enum Refusal {
     #[error("the depths do not agree")]
     DepthsDisagree,
     /// The two directions do not agree within their covariances.
-    #[error("both directions disagree: χ² is {0:.1}")]
+    #[error("the two directions disagree: χ² = {0:.1}")]
     NotReciprocal(f64),
     /// Another pose explains the images as well: the texture repeats.
-    #[error("another place explains the images as well")]
+    #[error("another pose explains the images equally well")]
     Ambiguous,
     /// The measurement is too uncertain to be of use.
     #[error("the measurement is too uncertain")]

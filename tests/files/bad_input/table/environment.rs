@@ -3,16 +3,10 @@
 use super::{Row, row};
 
 pub const CONFIGURATION: &[Row] = &[
+    row("a missing file", "", "semidense --config none.toml run", 1, &["none.toml", "--config"]),
+    row("an endless file (device)", "", "semidense --config /dev/zero run", 1, &["a device"]),
     row(
-        "a file that is not there",
-        "",
-        "semidense --config none.toml run",
-        1,
-        &["none.toml", "--config"],
-    ),
-    row("a file that never ends", "", "semidense --config /dev/zero run", 1, &["a device"]),
-    row(
-        "a pipe that nobody writes to",
+        "a pipe without a writer",
         "mkfifo pipe",
         "semidense --config pipe run",
         1,
@@ -28,7 +22,7 @@ pub const CONFIGURATION: &[Row] = &[
     ),
     row("not TOML", "echo '[[[' > bad.toml", "semidense --config bad.toml run", 1, &["bad.toml:1"]),
     row(
-        "a key that is not known",
+        "an unknown key",
         "",
         "semidense run --set mapper.thread=1",
         1,
@@ -42,15 +36,15 @@ pub const CONFIGURATION: &[Row] = &[
         &["0 to 256"],
     ),
     row(
-        "a value of another kind",
+        "a value of the wrong type",
         "",
         "semidense run --set tracker.deadline_ms=soon",
         1,
         &["expected a number"],
     ),
     row("an invalid instance name", "", "semidense run --instance a/b", 1, &["a/b"]),
-    row("a word that is not a log level", "", "semidense run --log loud", 1, &["--log loud"]),
-    row("an option that is not known", "", "semidense run --fast", 2, &["--fast"]),
+    row("an unknown log level", "", "semidense run --log loud", 1, &["--log loud"]),
+    row("an unknown option", "", "semidense run --fast", 2, &["--fast"]),
     row(
         "an option of another command",
         "",
@@ -69,15 +63,15 @@ pub const CONFIGURATION: &[Row] = &[
 
 pub const OUTPUT: &[Row] = &[
     row(
-        "a file in the place of a map",
+        "a file in place of a map",
         "touch file",
         "semidense run recording --map file",
         1,
         &["/file is a file; name a folder"],
     ),
-    row("the same to read", "touch file", "semidense map info file", 1, &["file is a file"]),
+    row("the same for reading", "touch file", "semidense map info file", 1, &["file is a file"]),
     row(
-        "a file in the place of the folder",
+        "a file in place of the folder",
         "touch file",
         "semidense run recording --output file",
         1,
@@ -99,7 +93,7 @@ pub const OUTPUT: &[Row] = &[
     ),
     row("a dataset below a file", "touch file", "semidense simulate --output file/x", 1, &["file"]),
     row(
-        "a dataset into a folder with something in it",
+        "a dataset into a folder that is not empty",
         "",
         "semidense simulate --output recording",
         1,
@@ -116,7 +110,7 @@ pub const OUTPUT: &[Row] = &[
 
 pub const TRAJECTORIES: &[Row] = &[
     row(
-        "an estimate that is not there",
+        "a missing estimate",
         "",
         "semidense evaluate none.txt recording/groundtruth.txt",
         1,
@@ -124,14 +118,14 @@ pub const TRAJECTORIES: &[Row] = &[
     ),
     row("a folder", "", "semidense evaluate recording recording/groundtruth.txt", 1, &["a folder"]),
     row(
-        "a file that never ends",
+        "an endless file (device)",
         "",
         "semidense evaluate /dev/zero recording/groundtruth.txt",
         1,
         &["a device"],
     ),
     row(
-        "a pipe that nobody writes to",
+        "a pipe without a writer",
         "mkfifo pipe",
         "semidense evaluate pipe recording/groundtruth.txt",
         1,
@@ -152,28 +146,28 @@ pub const TRAJECTORIES: &[Row] = &[
         &["e:1: 3 columns"],
     ),
     row(
-        "something that is not a number",
+        "a value that is not a number",
         "echo '1 0 nan 0 0 0 0 1' > e",
         "semidense evaluate e recording/groundtruth.txt",
         1,
         &["'nan'"],
     ),
     row(
-        "trajectories of other times",
+        "trajectories without common times",
         "printf '1 0 0 0 0 0 0 1\\n2 0 0 0 0 0 0 1\\n3 1 0 0 0 0 0 1\\n' > e; sed 's/^[0-9]/9/' e > f",
         "semidense evaluate e f",
         1,
         &["e against f"],
     ),
     row(
-        "a sensor file that is not there",
+        "a missing sensor file",
         "",
         "semidense evaluate recording/groundtruth.txt recording/groundtruth.txt --sensor none.yaml",
         1,
         &["none.yaml"],
     ),
     row(
-        "a file that is not a sensor's",
+        "a file that is not a sensor file",
         "",
         "semidense evaluate recording/groundtruth.txt recording/groundtruth.txt --sensor rig.toml",
         1,
@@ -217,5 +211,5 @@ pub const LIMITS: &[Row] = &[
         1,
         &["file", "SEMIDENSE_ROOT"],
     ),
-    row("nothing that runs", "", "semidense status --once", 1, &["nothing is running"]),
+    row("no running instance", "", "semidense status --once", 1, &["nothing is running"]),
 ];
