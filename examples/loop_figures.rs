@@ -77,6 +77,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
         initial_depth: DepthOrigin::Images,
         max_frames: arguments.frames,
         strict: true,
+        brighten: true,
     };
     let name = arguments.source.to_string();
     let record = replay(source.as_mut(), &name, &config, &mut |_| true)?;

@@ -19,6 +19,7 @@ use crate::service::run_error::RunError;
 use crate::service::schedule::apply;
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::image::brightening::Brightening;
 use crate::wire::message::{FrameHeader, HealthMessage, PoseMessage, StepMessage};
 use crate::wire::place::{Claim, Place};
 use crate::wire::port::{Access, Hub, Publisher, Subscriber, wait};
@@ -96,6 +97,8 @@ struct Shell<'a> {
     absence: Option<String>,
     /// Images of a recording that could not be used.
     refused: RefusedImages,
+    /// Brightens dim images, where that is configured.
+    brightening: Option<Brightening>,
     /// First sequence of a camera's frames.
     first_sequence: u64,
     /// Frames no newer than the last one of the previous capture are not sent.
@@ -152,6 +155,7 @@ impl<'a> Shell<'a> {
             pace: None,
             absence: None,
             refused: RefusedImages::default(),
+            brightening: config.capture.brighten.then(Brightening::default),
             first_sequence: 0,
             predecessor: Predecessor::default(),
             next_sequence: None,
@@ -313,6 +317,9 @@ impl<'a> Shell<'a> {
             }
             Err(error) => return Err(error.into()),
         };
+        if let Some(brightening) = &mut self.brightening {
+            brighten(brightening, loan.bytes_mut(), self.intrinsics.width);
+        }
         self.refused.accept();
         stamp.sequence = stamp.sequence.saturating_add(self.first_sequence);
         if self.predecessor.is_ahead_of(&stamp) {
@@ -409,6 +416,19 @@ impl<'a> Shell<'a> {
         self.frames.serve_late_joiners();
         self.health.report();
         if self.shutdown.is_requested() { Err(RunError::Interrupted) } else { Ok(()) }
+    }
+}
+
+/// Brightens a dim image and logs a change of the factor.
+fn brighten(brightening: &mut Brightening, pixels: &mut [u8], width: usize) {
+    let before = brightening.factor();
+    brightening.apply(pixels, width);
+    match brightening.factor() {
+        factor if factor == before => {}
+        1 => tracing::info!("capture: the images are bright enough again"),
+        factor => tracing::warn!(
+            "capture: the images are dim; their grey levels are multiplied by {factor}. Add light or expose longer"
+        ),
     }
 }
 

@@ -81,6 +81,8 @@ pub struct CaptureConfig {
     /// Whether a damaged or missing image of a recording ends the run with an error, as `--strict` does; otherwise it
     /// is left out and counted.
     pub strict: bool,
+    /// Whether the grey levels of dim images are doubled up to three times before anything is estimated from them.
+    pub brighten: bool,
     /// Longest wait for tracker and mapper to get ready before a recording starts, seconds.
     pub connect_timeout_s: f64,
     /// Lockstep: longest wait for a frame to enter the map, seconds.
@@ -97,6 +99,7 @@ impl Default for CaptureConfig {
             source: "sim".to_owned(),
             rig: String::new(),
             strict: false,
+            brighten: true,
             connect_timeout_s: 30.0,
             step_timeout_s: 60.0,
             scheduling: SchedulingParams { priority: 80, ..SchedulingParams::default() },

@@ -56,7 +56,7 @@ pub enum DepthOrigin {
 }
 
 /// What to replay and how.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct ReplayConfig {
     /// Parameters of the tracker.
     pub tracker: TrackerParams,
@@ -72,6 +72,23 @@ pub struct ReplayConfig {
     pub max_frames: Option<usize>,
     /// Whether an unusable image ends the replay; otherwise it is left out and counted.
     pub strict: bool,
+    /// Whether dim images are brightened.
+    pub brighten: bool,
+}
+
+impl Default for ReplayConfig {
+    fn default() -> Self {
+        Self {
+            tracker: TrackerParams::default(),
+            mapper: MapperParams::default(),
+            map: MapConfig::default(),
+            poses: PoseOrigin::default(),
+            initial_depth: DepthOrigin::default(),
+            max_frames: None,
+            strict: false,
+            brighten: true,
+        }
+    }
 }
 
 /// Progress after a frame, for an observer.
@@ -160,6 +177,7 @@ pub fn replay(
         max_frames: config.max_frames.unwrap_or(usize::MAX),
         with_depth: config.initial_depth == DepthOrigin::Sensor,
         is_strict: config.strict,
+        brightens: config.brighten,
     };
     let begin = Instant::now();
     let mut refused = RefusedImages::default();

@@ -1,5 +1,6 @@
 //! Images, pyramids and gradients.
 
+pub mod brightening;
 pub mod buffer;
 pub mod gray;
 pub mod noise;

@@ -15,6 +15,7 @@ mod accuracy;
 mod camera_effects;
 mod depth_modes;
 mod determinism;
+mod dim_light;
 mod evaluation;
 mod interval_filter;
 mod keyframe_reuse;

@@ -1,0 +1,186 @@
+//! Brightens the frames of a camera in dim light before anything is estimated from them.
+//!
+//! Thresholds on residuals and gradients are in grey levels, and an image whose contrast is as small as they are passes
+//! every one of them: occlusions and wrong matches agree, and wrong poses are claimed. A factor on the grey levels gives
+//! dim images the contrast of ordinary ones; their noise grows with it, to that of an ordinary camera.
+
+/// Grey level below which 90 % of an image lie when it is dim: a quarter of the range.
+const DIM_GREY: u8 = 64;
+/// Grey level below which 90 % of a brightened image stay, so that its light parts are not saturated.
+const BRIGHT_GREY: u8 = 224;
+/// Binary logarithm of the largest factor: beyond 8 grey levels are too coarse to be tracked on.
+const MAX_DOUBLINGS: u8 = 3;
+/// Frames in a row that must be dim before the factor grows: a second or less. A covered lens has passed by then, and a
+/// passage into the dark has ended.
+const DIM_FRAMES: u8 = 20;
+/// Distance of the pixels that are measured, in columns and rows: some thousand of a VGA image.
+const STEP_PX: usize = 8;
+
+/// The factor on the grey levels of a stream of frames: 1, 2, 4 or 8. It follows lasting changes of light alone, and
+/// falls at once where the image would become too bright.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Brightening {
+    doublings: u8,
+    /// Dim frames in a row.
+    dim_frames: u8,
+    has_begun: bool,
+}
+
+impl Brightening {
+    /// The factor on the grey levels of the last frame.
+    pub fn factor(&self) -> u8 {
+        1 << self.doublings
+    }
+
+    /// Brightens the next frame, row-major with `width` columns. Frames that are not dim are left unchanged, and so are
+    /// those without any light.
+    pub fn apply(&mut self, pixels: &mut [u8], width: usize) {
+        let Some(bright) = bright_grey(pixels, width) else { return };
+        let brightened = |doublings: u8| u32::from(bright) << doublings;
+        while self.doublings > 0 && brightened(self.doublings) > u32::from(BRIGHT_GREY) {
+            self.doublings -= 1;
+        }
+        let is_dim = brightened(self.doublings) < u32::from(DIM_GREY);
+        self.dim_frames = if is_dim { self.dim_frames.saturating_add(1) } else { 0 };
+        if is_dim && (!self.has_begun || self.dim_frames >= DIM_FRAMES) {
+            while self.doublings < MAX_DOUBLINGS && brightened(self.doublings) < u32::from(DIM_GREY)
+            {
+                self.doublings += 1;
+            }
+            self.dim_frames = 0;
+        }
+        self.has_begun = true;
+        if self.doublings > 0 {
+            let (factor, largest) = (self.factor(), u8::MAX >> self.doublings);
+            for pixel in pixels {
+                // Above the largest the result is saturated.
+                *pixel = if *pixel > largest { u8::MAX } else { *pixel * factor };
+            }
+        }
+    }
+}
+
+/// The grey level below which 90 % of an image lie; `None` for an image that is too small, or so dark that it shows
+/// nothing at any factor.
+fn bright_grey(pixels: &[u8], width: usize) -> Option<u8> {
+    /// Below this, the largest factor does not reach [`DIM_GREY`].
+    const MIN_GREY: u8 = DIM_GREY >> MAX_DOUBLINGS;
+    let mut counts = [0_u32; 256];
+    let rows = pixels.chunks_exact(width.max(1)).skip(STEP_PX / 2).step_by(STEP_PX);
+    for row in rows {
+        for &grey in row.iter().skip(STEP_PX / 2).step_by(STEP_PX) {
+            counts[usize::from(grey)] += 1;
+        }
+    }
+    let measured: u32 = counts.iter().sum();
+    let mut brighter = measured / 10;
+    let bright = (0..=u8::MAX).rev().find(|&grey| {
+        let count = counts[usize::from(grey)];
+        let is_reached = count > brighter;
+        brighter = brighter.saturating_sub(count);
+        is_reached
+    })?;
+    (bright >= MIN_GREY).then_some(bright)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WIDTH: usize = 160;
+
+    /// An image whose grey levels rise along the rows, from 0 to `largest`.
+    fn ramp(largest: usize) -> Vec<u8> {
+        (0..WIDTH * 120).map(|i| ((i % WIDTH) * largest / (WIDTH - 1)) as u8).collect()
+    }
+
+    fn brightened(brightening: &mut Brightening, image: &[u8]) -> Vec<u8> {
+        let mut pixels = image.to_vec();
+        brightening.apply(&mut pixels, WIDTH);
+        pixels
+    }
+
+    #[test]
+    fn an_image_in_ordinary_light_is_left_unchanged() {
+        let mut brightening = Brightening::default();
+        for largest in [80, 120, 255] {
+            let image = ramp(largest);
+            assert_eq!(brightened(&mut brightening, &image), image);
+            assert_eq!(brightening.factor(), 1);
+        }
+    }
+
+    #[test]
+    fn the_first_dim_image_sets_the_factor_that_its_light_requires() {
+        for (largest, factor) in [(60, 2), (30, 4), (15, 8), (10, 8)] {
+            let mut brightening = Brightening::default();
+            let image = ramp(largest);
+            let expected: Vec<u8> = image.iter().map(|grey| grey * factor).collect();
+            assert_eq!(brightened(&mut brightening, &image), expected);
+            assert_eq!(brightening.factor(), factor);
+        }
+    }
+
+    #[test]
+    fn a_black_image_stays_black_and_decides_nothing() {
+        let mut brightening = Brightening::default();
+        let black = vec![3; WIDTH * 120];
+        for _ in 0..100 {
+            assert_eq!(brightened(&mut brightening, &black), black);
+        }
+        assert_eq!(brightening.factor(), 1);
+        brightened(&mut brightening, &ramp(30));
+        assert_eq!(brightening.factor(), 4);
+        // A covered lens keeps it.
+        brightened(&mut brightening, &black);
+        assert_eq!(brightening.factor(), 4);
+    }
+
+    #[test]
+    fn a_short_shadow_changes_nothing_and_a_lasting_one_does() {
+        let mut brightening = Brightening::default();
+        let (light, shadow) = (ramp(200), ramp(40));
+        brightened(&mut brightening, &light);
+        for _ in 0..10 {
+            for _ in 1..DIM_FRAMES {
+                assert_eq!(brightened(&mut brightening, &shadow), shadow);
+            }
+            assert_eq!(brightened(&mut brightening, &light), light);
+        }
+        for _ in 1..DIM_FRAMES {
+            assert_eq!(brightened(&mut brightening, &shadow), shadow);
+        }
+        brightened(&mut brightening, &shadow);
+        assert_eq!(brightening.factor(), 2);
+    }
+
+    #[test]
+    fn light_lowers_the_factor_with_its_first_image() {
+        let mut brightening = Brightening::default();
+        brightened(&mut brightening, &ramp(15));
+        assert_eq!(brightening.factor(), 8);
+        for (largest, factor) in [(30, 4), (120, 1), (70, 1)] {
+            brightened(&mut brightening, &ramp(largest));
+            assert_eq!(brightening.factor(), factor, "{largest}");
+        }
+    }
+
+    #[test]
+    fn highlights_of_a_dim_image_are_saturated() {
+        let mut brightening = Brightening::default();
+        let mut image = ramp(30);
+        image[..WIDTH].fill(200);
+        let pixels = brightened(&mut brightening, &image);
+        assert!(pixels[..WIDTH].iter().all(|&grey| grey == u8::MAX));
+        assert_eq!(pixels[WIDTH..], image[WIDTH..].iter().map(|grey| 4 * grey).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn images_of_any_size_are_accepted() {
+        for (len, width) in [(0, 0), (0, 8), (1, 1), (3, 0), (30, 4), (7, 100)] {
+            let mut pixels = vec![20; len];
+            Brightening::default().apply(&mut pixels, width);
+            assert_eq!(pixels.len(), len);
+        }
+    }
+}
