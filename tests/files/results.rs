@@ -380,7 +380,7 @@ fn given_poses_and_depth_are_not_judged_as_estimates() {
     assert!(of(&from_sensor)["depth_relative_error_median"].is_null());
     let given = RunRecord { depth_scale: DepthScale::Given, ..estimated };
     let reasons = of(&given)["grade"]["reasons"].to_string();
-    assert!(reasons.contains("2 parts") && !reasons.contains("scale"), "{reasons}");
+    assert!(reasons.contains("2 separate parts") && !reasons.contains("scale"), "{reasons}");
 }
 
 #[test]

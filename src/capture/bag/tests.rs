@@ -176,7 +176,7 @@ fn images_that_cannot_be_used_are_one_error_each() {
     let (frames, errors) = play(&mut bag.unwrap());
     assert_eq!(frames, [(0, 0), (7, 8)]);
     let expected = [
-        "`yuv444`: known are",
+        "`yuv444` is not supported; supported are",
         "767 of 768 bytes",
         "rows of 1 bytes",
         "is 16x24",

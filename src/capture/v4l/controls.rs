@@ -337,7 +337,9 @@ mod tests {
         assert_eq!(fake.value_of(EXPOSURE_AUTO), EXPOSURE_MANUAL);
         assert_eq!(fake.value_of(EXPOSURE_ABSOLUTE), 333);
         assert_eq!(refused.len(), 1, "{refused:?}");
-        assert!(refused[0].starts_with("capture.camera.focus: the camera has no focus"));
+        assert!(
+            refused[0].starts_with("capture.camera.focus: the camera has no control for focus")
+        );
     }
 
     #[test]
@@ -346,7 +348,7 @@ mod tests {
         fake.refuse_controls(Errno::IO);
         let mut device = fake.device();
         let refused = apply(&mut device, &params(|p| p.exposure_us = Setting::Value(8000)));
-        assert!(refused[0].contains("exposure_us: the camera refuses ("), "{refused:?}");
+        assert!(refused[0].contains("exposure_us: the camera refused it ("), "{refused:?}");
         let refused = apply(&mut device, &params(|p| p.gain = Setting::Auto));
         assert!(refused[0].contains("gain: the camera has no automatic gain"), "{refused:?}");
     }

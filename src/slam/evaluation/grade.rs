@@ -251,7 +251,7 @@ mod tests {
                 GradeLevel::Doubtful,
             ),
             (GradeInput { frames_lost: 30, losses: 1, ..good }, "lost once", GradeLevel::Poor),
-            (GradeInput { epochs: 3, ..good }, "3 parts", GradeLevel::Doubtful),
+            (GradeInput { epochs: 3, ..good }, "3 separate parts", GradeLevel::Doubtful),
             (
                 GradeInput { rejections: 1, ..good },
                 "contradicted itself once",

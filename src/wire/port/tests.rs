@@ -166,7 +166,7 @@ fn another_wire_version_is_refused_with_both_versions() {
     for access in [Access::Member, Access::Observer] {
         let error = Hub::join(&rig.place, "observer", access).unwrap_err().to_string();
         assert!(
-            error.contains(&format!("speaks wire version 1, this program {WIRE_VERSION}")),
+            error.contains(&format!("uses wire version 1, this program {WIRE_VERSION}")),
             "{error}"
         );
     }
