@@ -64,7 +64,7 @@ impl Brightening {
 /// nothing at any factor.
 fn bright_grey(pixels: &[u8], width: usize) -> Option<u8> {
     /// Below this, the largest factor does not reach [`DIM_GREY`].
-    const MIN_GREY: u8 = DIM_GREY >> MAX_DOUBLINGS;
+    const MIN_USABLE_GREY: u8 = DIM_GREY >> MAX_DOUBLINGS;
     let mut counts = [0_u32; 256];
     let rows = pixels.chunks_exact(width.max(1)).skip(STEP_PX / 2).step_by(STEP_PX);
     for row in rows {
@@ -80,7 +80,7 @@ fn bright_grey(pixels: &[u8], width: usize) -> Option<u8> {
         brighter = brighter.saturating_sub(count);
         is_reached
     })?;
-    (bright >= MIN_GREY).then_some(bright)
+    (bright >= MIN_USABLE_GREY).then_some(bright)
 }
 
 #[cfg(test)]
