@@ -98,7 +98,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
             });
             println!(
                 "frame {} {millis:.0} ms {} {pair:?} likeness {} truth {apart:.2?} measured {found:.2?} {:?}",
-                search.sequence, report.keyframe_id, report.likeness, report.fate
+                search.sequence, report.keyframe_id, report.likeness, report.outcome
             );
         }
         return Ok(());
@@ -155,7 +155,7 @@ fn unit_m(source: &mut dyn FrameSource, keyframe: &Keyframe) -> Option<f64> {
 /// Share of the points of one keyframe that the other sees, according to ground truth.
 fn overlap(i: &Placed, j: &Placed) -> f64 {
     let world_from_j = SE3 { ..j.world_from_keyframe.rigid };
-    i.keyframe.usage(&i.world_from_keyframe.locate(&world_from_j))
+    i.keyframe.usage(&i.world_from_keyframe.inverse_transform_pose(&world_from_j))
 }
 
 fn truth(i: &Placed, j: &Placed) -> Sim3 {

@@ -24,7 +24,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let camera = few.manifest.camera;
     // Describes the keyframes that have no description yet.
     let mut mapper = Mapper::new(camera, MapperParams::default())?;
-    mapper.begin_in(few.map, MapUse::Extend)?;
+    mapper.start_in_map(few.map, MapUse::Extend)?;
     for detail in [MapDetail::Full, MapDetail::Small] {
         let folder = tempfile::tempdir()?;
         let again = mapper.map().keyframes.iter().cycle().take(count);
@@ -45,7 +45,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let described = loaded.map.keyframes.iter().filter(|of| of.description.is_some());
             let described = described.count();
             let mut mapper = Mapper::new(camera, MapperParams::default())?;
-            mapper.begin_in(loaded.map, MapUse::Extend)?;
+            mapper.start_in_map(loaded.map, MapUse::Extend)?;
             println!(
                 "{detail:?}: {count} keyframes, {described} described, {:.1} MB, read {:.2} s, with what they look like {:.2} s",
                 1e-6 * bytes as f64,

@@ -175,7 +175,7 @@ fn play(source: &mut dyn FrameSource) {
 /// A bag.
 pub fn bag(bytes: &[u8]) {
     /// Upper limit for the frames read: a bag may contain thousands.
-    const MOST_FRAMES: usize = 100;
+    const MAX_FRAMES: usize = 100;
     thread_local! {
         static FOLDER: tempfile::TempDir = tempfile::tempdir().expect("a temporary folder");
     }
@@ -190,14 +190,14 @@ pub fn bag(bytes: &[u8]) {
         }
         let mut pixels = vec![0; k.width * k.height];
         let mut last = None;
-        for _ in 0..MOST_FRAMES {
+        for _ in 0..MAX_FRAMES {
             match source.next_into(&mut pixels) {
                 Ok(Some(stamp)) => {
                     assert!(last.is_none_or(|last| (stamp.sequence, stamp.capture_nanos) > last));
                     last = Some((stamp.sequence, stamp.capture_nanos));
                 }
                 Ok(None) => break,
-                Err(error) if error.is_passing() => {}
+                Err(error) if error.is_transient() => {}
                 Err(_) => break,
             }
         }
@@ -467,7 +467,7 @@ fn map_step(
         // An image that is too small is refused, as in the mapper process.
         let Ok(mut fresh) = Mapper::new(view.intrinsics, MapperParams::default()) else { return };
         if let Some((_, before)) = mapper.take() {
-            fresh.succeed(before);
+            fresh.continue_from(before);
         }
         *mapper = Some((view.intrinsics, fresh));
     }

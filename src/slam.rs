@@ -14,13 +14,13 @@ pub mod graph;
 pub mod image;
 pub mod kernel;
 pub mod keyframe;
+pub mod keyframe_pose_covariance;
 pub mod loops;
 pub mod map;
 pub mod mapper;
 pub mod modes;
 pub mod odometry;
 pub mod parameter;
-pub mod place_covariance;
 pub mod places;
 pub mod pose;
 #[cfg(test)]

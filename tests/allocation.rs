@@ -118,7 +118,7 @@ fn tracing_points_allocates_nothing() {
         }
         map.restart(&pixels, 1.0, 100_000);
         filter.restart_where_empty(&map);
-        filter.restart_with_known(&mut map, &CandidateParams::default());
+        filter.restart_from_map(&mut map, &CandidateParams::default());
         for (frame, shift) in frames.iter().zip(1..) {
             let mut moved = SE3::identity();
             // A wall at depth 1 moves by `shift` pixels.

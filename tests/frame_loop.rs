@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use semidense::service::config::Config;
 use semidense::service::mode::Mode;
-use semidense::service::schedule::in_force;
+use semidense::service::schedule::active_scheduling;
 use semidense::service::shutdown::Shutdown;
 use semidense::service::tracker;
 use semidense::slam::frame::FrameView;
@@ -210,7 +210,7 @@ fn the_loop_allocates_no_more_than_its_transport() {
     let _ = writeln!(std::io::stderr(), "{line}");
     assert!(tracked > COUNTED / 2, "only {tracked} frames were tracked: this measures nothing");
     assert!(of_loop.allocations <= of_transport.allocations, "{line}");
-    let allowed = if in_force().memory_locked { 0 } else { UNLOCKED_PAGE_FAULTS };
+    let allowed = if active_scheduling().memory_locked { 0 } else { UNLOCKED_PAGE_FAULTS };
     assert!(of_loop.page_faults <= allowed, "{line}");
     // One wait per frame, and some that a stale wake-up ended early.
     assert!(of_loop.waits <= COUNTED + COUNTED / 5 + 20, "{line}");

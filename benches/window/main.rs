@@ -24,7 +24,7 @@ use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::slam::map::Map;
 use semidense::slam::modes::ModeCovariance;
 use semidense::slam::window::comparison::{
-    Compared, LANES, Look, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted,
+    Compared, LANES, Pair, PairSums, PatternAppearance, Patterns, Robustness, SAMPLES, Wanted,
 };
 use semidense::slam::window::frames::TrackedFrame;
 use semidense::slam::window::params::WindowParams;
@@ -67,13 +67,13 @@ fn comparisons(camera: &Intrinsics, pixels: &[u8]) {
     let pair = Pair::new(&observer_from_host, camera, wanted);
     // No pattern is an outlier: derivatives are computed for each.
     let robustness = Robustness { huber_grey: 9.0, most_energy: f32::INFINITY };
-    let look = Look { shape: [1.0; SAMPLES], weight: [0.5; SAMPLES] };
+    let appearance = PatternAppearance { shape: [1.0; SAMPLES], weight: [0.5; SAMPLES] };
     let mut patterns = vec![Patterns::NONE; PATTERNS.div_ceil(LANES)];
     for i in 0..PATTERNS {
         let (u, v) = (60 + (i * 37) % (camera.width - 120), 60 + (i * 53) % (camera.height - 120));
         let at = |pixel: usize, centre: f64, focal: f64| ((pixel as f64 - centre) / focal) as f32;
         let ray = [at(u, camera.cx, camera.fx), at(v, camera.cy, camera.fy)];
-        patterns[i / LANES].set(i % LANES, &look, ray);
+        patterns[i / LANES].set(i % LANES, &appearance, ray);
         patterns[i / LANES].inverse_depth[i % LANES] = 0.5;
     }
     println!(
@@ -130,7 +130,7 @@ fn walk(
         let place = world_from_first.inverse() * world_from_keyframe;
         map.keyframes.push(keyframe(simulator, camera, id as u64, index, place));
         let begin = cpu_secs();
-        if window.take_in(&map, id as u64) {
+        if window.update_from_map(&map, id as u64) {
             window.take_frames(&mut frames);
             let snapshot = cpu_secs() - begin;
             let begin = cpu_secs();
@@ -139,7 +139,7 @@ fn walk(
             let begin = cpu_secs();
             black_box(window.correction(&map, |_| (ModeCovariance::ZERO, None)));
             let correction = cpu_secs() - begin;
-            drop(window.take_placed());
+            drop(window.take_realigned());
             if let Some(Adjustment { free, fixed, comparisons, .. }) = adjusted {
                 let (keyframes, memory) = (id + 1, resident_bytes() - map_bytes(&map));
                 costs.push(Cost {

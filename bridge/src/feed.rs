@@ -76,11 +76,11 @@ pub struct Listener {
 
 impl Listener {
     /// The next event; `None` if none arrives within `timeout`, an error once the feed is over.
-    pub fn next(&self, timeout: Duration) -> Result<Option<Event>, FeedOver> {
+    pub fn next(&self, timeout: Duration) -> Result<Option<Event>, FeedEnded> {
         match self.events.recv_timeout(timeout) {
             Ok(event) => Ok(Some(event)),
             Err(RecvTimeoutError::Timeout) => Ok(None),
-            Err(RecvTimeoutError::Disconnected) => Err(FeedOver),
+            Err(RecvTimeoutError::Disconnected) => Err(FeedEnded),
         }
     }
 
@@ -93,7 +93,7 @@ impl Listener {
 /// The feed has ended: see [`Feed::failure`].
 #[derive(Debug, thiserror::Error)]
 #[error("the topics are no longer read")]
-pub struct FeedOver;
+pub struct FeedEnded;
 
 #[derive(Debug, Default)]
 struct Shared {
@@ -109,7 +109,7 @@ impl Shared {
 
 fn read(mut session: Session, shared: &Shared) {
     while !shared.is_over.load(Ordering::Relaxed) {
-        let outcome = session.read(None, WAKE_PERIOD, |event| shared.lock().give(&event));
+        let outcome = session.read(None, WAKE_PERIOD, |event| shared.lock().deliver(&event));
         if let Err(error @ (SessionError::Open(_) | SessionError::Wait(_))) = outcome {
             shared.lock().failure = Some(error.to_string());
             break;
@@ -128,10 +128,10 @@ struct State {
 }
 
 impl State {
-    fn give(&mut self, event: &Event) {
+    fn deliver(&mut self, event: &Event) {
         self.recent.keep(event);
         let before: u64 = self.outlets.iter().map(Outlet::lost).sum();
-        self.outlets.retain_mut(|outlet| outlet.give(event));
+        self.outlets.retain_mut(|outlet| outlet.deliver(event));
         self.lost += self.outlets.iter().map(Outlet::lost).sum::<u64>().saturating_sub(before);
     }
 
@@ -142,7 +142,7 @@ impl State {
         let mut outlet = Outlet { sender, lost: Arc::clone(&lost), owed: None };
         if self.failure.is_none() {
             for event in recent.values() {
-                outlet.give(event);
+                outlet.deliver(event);
             }
             self.outlets.push(outlet);
         }
@@ -165,7 +165,7 @@ impl Outlet {
     }
 
     /// Offers the event to the listener; returns whether that still exists.
-    fn give(&mut self, event: &Event) -> bool {
+    fn deliver(&mut self, event: &Event) -> bool {
         if let Some(owed) = self.owed.take()
             && let Err(error) = self.sender.try_send(owed)
         {
@@ -225,8 +225,8 @@ mod tests {
     fn a_slow_listener_loses_events_and_delays_nobody() {
         let mut state = State::default();
         let (slow, quick) = (state.listen(2), state.listen(8));
-        state.give(&Event::Joined);
-        (0..4).for_each(|_| state.give(&adjustment()));
+        state.deliver(&Event::Joined);
+        (0..4).for_each(|_| state.deliver(&adjustment()));
         assert_eq!((slow.lost(), quick.lost(), state.lost), (3, 0, 3));
         assert_eq!(quick.events.try_iter().count(), 5);
     }
@@ -235,24 +235,24 @@ mod tests {
     fn the_end_of_a_run_is_never_lost() {
         let mut state = State::default();
         let slow = state.listen(1);
-        state.give(&adjustment());
-        state.give(&Event::Left);
-        state.give(&adjustment());
+        state.deliver(&adjustment());
+        state.deliver(&Event::Left);
+        state.deliver(&adjustment());
         assert!(matches!(slow.events.try_recv(), Ok(Event::Adjustment(_))));
-        state.give(&adjustment());
+        state.deliver(&adjustment());
         assert!(matches!(slow.events.try_recv(), Ok(Event::Left)));
-        state.give(&adjustment());
+        state.deliver(&adjustment());
         assert!(matches!(slow.events.try_recv(), Ok(Event::Adjustment(_))));
     }
 
     #[test]
     fn a_late_listener_learns_that_the_run_exists_and_a_departed_one_is_removed() {
         let mut state = State::default();
-        state.give(&Event::Joined);
+        state.deliver(&Event::Joined);
         let late = state.listen(4);
         assert!(matches!(late.events.try_recv(), Ok(Event::Joined)));
         drop(late);
-        state.give(&Event::Left);
+        state.deliver(&Event::Left);
         assert!(state.outlets.is_empty());
         assert!(state.listen(4).events.try_recv().is_err(), "there is no run any more");
     }

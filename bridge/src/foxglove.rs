@@ -14,7 +14,7 @@ use std::time::Duration;
 use semidense::slam::keyframe::Keyframe;
 use tungstenite::{Error, Message, WebSocket};
 
-use crate::feed::FeedOver;
+use crate::feed::FeedEnded;
 use crate::foxglove::protocol::{
     Request, Subscription, advertisement, message_frame, parse_request, server_info, warning,
 };
@@ -72,7 +72,7 @@ pub enum FoxgloveError {
 pub fn serve(
     mut socket: WebSocket<TcpStream>,
     instance: &str,
-    next: impl Fn(Duration) -> Result<Option<Event>, FeedOver>,
+    next: impl Fn(Duration) -> Result<Option<Event>, FeedEnded>,
 ) -> Result<(), FoxgloveError> {
     socket.get_ref().set_nodelay(true)?;
     socket.get_ref().set_write_timeout(Some(WRITE_TIMEOUT))?;
@@ -160,13 +160,13 @@ impl Client {
 
     fn run(
         &mut self,
-        next: impl Fn(Duration) -> Result<Option<Event>, FeedOver>,
+        next: impl Fn(Duration) -> Result<Option<Event>, FeedEnded>,
     ) -> Result<(), FoxgloveError> {
         loop {
             match next(LISTEN_PERIOD) {
                 Ok(Some(event)) => self.put(&event)?,
                 Ok(None) => {}
-                Err(FeedOver) => {
+                Err(FeedEnded) => {
                     self.socket.close(None).map_err(Box::new)?;
                     return Ok(self.socket.flush().map_err(Box::new)?);
                 }

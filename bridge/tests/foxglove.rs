@@ -9,7 +9,7 @@ use std::sync::mpsc::{RecvTimeoutError, sync_channel};
 use std::time::Duration;
 
 use sample_run::{REALTIME, frame, graph, health, keyframe, pose, script};
-use semidense_bridge::feed::FeedOver;
+use semidense_bridge::feed::FeedEnded;
 use semidense_bridge::foxglove::{SUBPROTOCOLS, serve};
 use semidense_bridge::session::Event;
 use serde_json::{Value, json};
@@ -50,7 +50,7 @@ fn foxgloves_own_client_receives_what_it_subscribes_to() {
             serve(socket, "left", |timeout| match events.recv_timeout(timeout) {
                 Ok(event) => Ok(Some(event)),
                 Err(RecvTimeoutError::Timeout) => Ok(None),
-                Err(RecvTimeoutError::Disconnected) => Err(FeedOver),
+                Err(RecvTimeoutError::Disconnected) => Err(FeedEnded),
             })
         });
         let found = run_client(&address.to_string(), protocol, "left");

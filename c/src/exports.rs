@@ -32,7 +32,7 @@ fn call(act: impl FnOnce() -> Result<Status, Failure>) -> Status {
     failure.status
 }
 
-fn bad(what: &str) -> Failure {
+fn invalid_argument(what: &str) -> Failure {
     Failure::new(Status::ErrorArgument, what)
 }
 
@@ -50,16 +50,16 @@ unsafe fn text<'a>(text: *const c_char, name: &str) -> Result<Option<&'a str>, F
     }
     // SAFETY: it is not null, and the caller promises the zero at its end.
     let text = unsafe { CStr::from_ptr(text) };
-    text.to_str().map(Some).map_err(|_| bad(&format!("{name} is not UTF-8")))
+    text.to_str().map(Some).map_err(|_| invalid_argument(&format!("{name} is not UTF-8")))
 }
 
 /// Checks that `out` can be written to.
 fn check_out<T>(out: *mut T, name: &str) -> Result<(), Failure> {
     if out.is_null() {
-        return Err(bad(&format!("{name} is null")));
+        return Err(invalid_argument(&format!("{name} is null")));
     }
     if !out.is_aligned() {
-        return Err(bad(&format!("{name} is not aligned for its type")));
+        return Err(invalid_argument(&format!("{name} is not aligned for its type")));
     }
     Ok(())
 }
@@ -68,7 +68,7 @@ fn check_out<T>(out: *mut T, name: &str) -> Result<(), Failure> {
 ///
 /// # Safety
 /// `out` is null or valid for writes.
-unsafe fn give<T>(
+unsafe fn write_next<T>(
     reader: *mut ReaderHandle,
     out: *mut T,
     ask: impl FnOnce(&mut Reader) -> Result<Option<T>, Failure>,
@@ -76,7 +76,7 @@ unsafe fn give<T>(
     call(|| {
         check_out(out, "the structure to write to")?;
         let (value, nothing) =
-            table::with(number(reader), |reader| Ok((ask(reader)?, reader.nothing())))?;
+            table::with(number(reader), |reader| Ok((ask(reader)?, reader.empty_status())))?;
         let Some(value) = value else { return Ok(nothing) };
         // SAFETY: neither null nor misaligned, and the caller promises that it may be written to.
         unsafe { out.write(value) };
@@ -120,10 +120,10 @@ pub unsafe extern "C" fn semidense_open(
         let (instance, root) = unsafe { (text(instance, "instance")?, text(root, "root")?) };
         let known = wants::POSES | wants::FRAMES | wants::KEYFRAMES | wants::GRAPH;
         if wanted == 0 || wanted & !known != 0 {
-            return Err(bad("wanted is not a sum of SEMIDENSE_WANT_…"));
+            return Err(invalid_argument("wanted is not a sum of SEMIDENSE_WANT_…"));
         }
         let place = Place::new(instance.unwrap_or("semidense"), root.unwrap_or(""))
-            .map_err(|error| bad(&error.to_string()))?;
+            .map_err(|error| invalid_argument(&error.to_string()))?;
         let opened = open(&place, wanted, duration(timeout_ms))?;
         let handle = std::ptr::without_provenance_mut(table::insert(opened)?);
         // SAFETY: as above.
@@ -172,7 +172,7 @@ pub extern "C" fn semidense_wait(reader: *mut ReaderHandle, timeout_ms: i64) -> 
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn semidense_next_pose(reader: *mut ReaderHandle, pose: *mut Pose) -> Status {
     // SAFETY: the caller's promise.
-    unsafe { give(reader, pose, Reader::next_pose) }
+    unsafe { write_next(reader, pose, Reader::next_pose) }
 }
 
 /// Reads the newest frame, if unread: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The previous frame becomes
@@ -186,7 +186,7 @@ pub unsafe extern "C" fn semidense_newest_frame(
     frame: *mut Frame,
 ) -> Status {
     // SAFETY: the caller's promise.
-    unsafe { give(reader, frame, Reader::newest_frame) }
+    unsafe { write_next(reader, frame, Reader::newest_frame) }
 }
 
 /// Reads the newest keyframe or revision of its depth, if unread: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The
@@ -200,7 +200,7 @@ pub unsafe extern "C" fn semidense_newest_keyframe(
     keyframe: *mut Keyframe,
 ) -> Status {
     // SAFETY: the caller's promise.
-    unsafe { give(reader, keyframe, Reader::newest_keyframe) }
+    unsafe { write_next(reader, keyframe, Reader::newest_keyframe) }
 }
 
 /// Reads the poses of all keyframes, if they have changed: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The
@@ -214,7 +214,7 @@ pub unsafe extern "C" fn semidense_newest_graph(
     graph: *mut Graph,
 ) -> Status {
     // SAFETY: the caller's promise.
-    unsafe { give(reader, graph, Reader::newest_graph) }
+    unsafe { write_next(reader, graph, Reader::newest_graph) }
 }
 
 /// Number of messages refused because they are malformed; 0 after an error.

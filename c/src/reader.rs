@@ -230,7 +230,7 @@ impl Reader {
     }
 
     /// The status without a message.
-    pub fn nothing(&self) -> Status {
+    pub fn empty_status(&self) -> Status {
         if self.has_ended { Status::Ended } else { Status::None }
     }
 

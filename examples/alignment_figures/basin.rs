@@ -126,7 +126,7 @@ fn pairs(scene: SceneKind, seed: u64, arguments: &Arguments) -> Result<Vec<Pair>
         let levels = num_levels(width, height);
         let mut pyramid = SumPyramid::with_size(width, height, levels, reference.finest_level());
         pyramid.fill(pixels);
-        let true_pose = keyframe.map_from_keyframe.locate(&true_pose).inverse();
+        let true_pose = keyframe.map_from_keyframe.inverse_transform_pose(&true_pose).inverse();
         pairs.push(Pair { reference, pyramid, true_pose });
     }
     Ok(pairs)

@@ -164,7 +164,7 @@ pub fn track(
             let unit_m = keyframe.map_from_keyframe.scale;
             let place = Sim3::new(*true_keyframe, unit_m);
             let current_from_keyframe = estimate.keyframe_from_camera.inverse();
-            let error = (current_from_keyframe * place.locate(&true_pose)).log();
+            let error = (current_from_keyframe * place.inverse_transform_pose(&true_pose)).log();
             due |= if choice.every > 0 { age >= choice.every } else { estimate.proposes_keyframe };
             frames.push(TrackedFrame {
                 estimate,

@@ -184,7 +184,7 @@ impl FrameSource for Bag {
         loop {
             match self.advance() {
                 Ok(Some(stamp)) if stamp.sequence < sequence => {}
-                Err(error) if error.is_passing() => {}
+                Err(error) if error.is_transient() => {}
                 Err(error) => return Err(error),
                 Ok(_) => return Ok(()),
             }

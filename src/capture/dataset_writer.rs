@@ -128,12 +128,12 @@ impl DatasetWriter {
             DatasetLayout::Tum => self.write_tum_lists(ground_truth)?,
             DatasetLayout::Euroc => self.write_euroc_lists(ground_truth)?,
         }
-        self.take_place()?;
+        self.rename_into_place()?;
         self.is_finished = true;
         Ok(())
     }
 
-    fn take_place(&self) -> Result<(), DatasetError> {
+    fn rename_into_place(&self) -> Result<(), DatasetError> {
         let old = beside(&self.target, "old");
         // Checked again: rendering takes time, and a folder filled meanwhile stays untouched.
         let had_one = is_dataset(&self.target);

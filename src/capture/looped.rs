@@ -85,7 +85,7 @@ impl FrameSource for Looped {
                 }
                 Ok(None) => break,
                 // A gap would recur with every repetition: the image is left out.
-                Err(error) if error.is_passing() => {
+                Err(error) if error.is_transient() => {
                     self.notices.push_back(format!("left out: {error}"))
                 }
                 Err(error) => return Err(error),

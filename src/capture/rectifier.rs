@@ -4,7 +4,7 @@ use std::path::Path;
 
 use crate::capture::rig::Rig;
 use crate::capture::source_error::SourceError;
-use crate::capture::v4l::pixel_format::{BrokenPicture, PixelFormat, unpack_gray};
+use crate::capture::v4l::pixel_format::{InvalidPicture, PixelFormat, unpack_gray};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::Rectification;
 use crate::slam::image::buffer::Image;
@@ -56,7 +56,7 @@ impl Rectifier {
         bytes: &[u8],
         stride: usize,
         pixels: &mut [u8],
-    ) -> Result<(), BrokenPicture> {
+    ) -> Result<(), InvalidPicture> {
         let Intrinsics { width, height, .. } = self.intrinsics();
         let is_packed = format == PixelFormat::Grey && stride == width;
         if let (true, Some(packed)) = (is_packed, bytes.get(..width * height)) {

@@ -1,7 +1,7 @@
 //! ROS images (`sensor_msgs/Image`) and their grey values.
 
 use crate::capture::decode_error::MAX_SIDE;
-use crate::capture::v4l::pixel_format::{BrokenPicture, PixelFormat, unpack_gray};
+use crate::capture::v4l::pixel_format::{InvalidPicture, PixelFormat, unpack_gray};
 use crate::slam::image::gray::gray_from_rgb;
 
 /// A ROS image; none of its fields is trusted.
@@ -34,7 +34,7 @@ pub enum RosImageError {
     Size(u32, u32),
     /// Rows or bytes that do not fit the size.
     #[error(transparent)]
-    Picture(#[from] BrokenPicture),
+    Picture(#[from] InvalidPicture),
     /// Rows too short for their pixels, or too few bytes.
     #[error("{found} bytes in rows of {step} for {width}x{height} pixels of {encoding}")]
     Short {
@@ -103,8 +103,8 @@ impl RosImage<'_> {
 
     /// The name of the format, shortened for an error.
     fn shown(&self) -> String {
-        const MOST: usize = 40;
-        self.encoding.escape_debug().take(MOST).collect()
+        const MAX_SHOWN: usize = 40;
+        self.encoding.escape_debug().take(MAX_SHOWN).collect()
     }
 
     /// The camera format with the same bytes.

@@ -55,7 +55,7 @@ pub(in crate::capture) struct Absence {
 
 impl Absence {
     /// An absence that may pass without intervention.
-    pub fn passing(reason: String) -> Self {
+    pub fn transient(reason: String) -> Self {
         Self { reason, passes: true }
     }
 }
@@ -134,7 +134,7 @@ pub trait FrameSource: Send {
         loop {
             match self.next_into(&mut pixels) {
                 Ok(Some(stamp)) if stamp.sequence < sequence => {}
-                Err(error) if error.is_passing() => {}
+                Err(error) if error.is_transient() => {}
                 Err(error) => return Err(error),
                 Ok(_) => return Ok(()),
             }

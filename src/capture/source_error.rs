@@ -179,7 +179,7 @@ impl SourceError {
 
     /// Whether only this frame is lost and the next one may be valid: a damaged frame of a camera, a damaged or missing
     /// image of a recording.
-    pub fn is_passing(&self) -> bool {
+    pub fn is_transient(&self) -> bool {
         matches!(self, Self::BrokenFrame { .. } | Self::Image(_) | Self::BagImage { .. })
     }
 }

@@ -240,13 +240,13 @@ fn recognise(path: &Path) -> Result<SourceName, SourceError> {
         Err(_) if has_kind(path) => {
             return error(format!("unknown kind; sources are {SOURCE_FORMS}"));
         }
-        Err(cause) if cause.kind() == ErrorKind::NotFound => return Err(no_path(path)),
+        Err(cause) if cause.kind() == ErrorKind::NotFound => return Err(missing_path(path)),
         Err(cause) => return error(cause.to_string()),
     };
     if kind.is_dir() {
         return match SourceName::of_folder(path) {
             Some(known) => Ok(known),
-            None if mcap_files(path).is_empty() => error(nothing_known_in(path)),
+            None if mcap_files(path).is_empty() => error(no_recording_in(path)),
             None => only_mcap(path).map(|file| SourceName::Mcap { file, topic: None }),
         };
     }
@@ -257,7 +257,7 @@ fn recognise(path: &Path) -> Result<SourceName, SourceError> {
     match path.to_str() {
         Some(device) if is_video_device() => Ok(SourceName::Camera(device.to_owned())),
         _ if kind.is_file() && has_ending(path, &VIDEO_ENDINGS) => Err(video(path)),
-        _ => error(what_a_file_is(path)),
+        _ => error(file_advice(path)),
     }
 }
 
@@ -268,7 +268,7 @@ fn has_kind(name: &Path) -> bool {
 }
 
 /// The error of a path that does not exist, with a hint: the number or the device of a camera is often tried.
-fn no_path(path: &Path) -> SourceError {
+fn missing_path(path: &Path) -> SourceError {
     let name = path.to_string_lossy();
     let number = name.strip_prefix("/dev/video").unwrap_or(&name);
     let is_number = !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit());
@@ -293,7 +293,7 @@ fn video(path: &Path) -> SourceError {
 }
 
 /// Advice for a file that is named instead of a folder.
-fn what_a_file_is(path: &Path) -> String {
+fn file_advice(path: &Path) -> String {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
     let folder = folder.unwrap_or(Path::new("."));
     let is_list =
@@ -318,7 +318,7 @@ fn quoted(path: &Path) -> String {
 }
 
 /// Describes what was searched for in a folder without a recording, and what was found.
-fn nothing_known_in(folder: &Path) -> String {
+fn no_recording_in(folder: &Path) -> String {
     let entries = entries(folder);
     let inner = entries.iter().filter(|path| path.is_dir()).find_map(|p| SourceName::of_folder(p));
     let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -409,7 +409,7 @@ mod tests {
 
     #[test]
     fn a_path_that_may_mean_a_camera_gets_a_hint() {
-        let told = |name: &str| no_path(Path::new(name)).to_string();
+        let told = |name: &str| missing_path(Path::new(name)).to_string();
         assert!(told("0").contains("no such file or folder: 0; a camera is named v4l:0 "));
         assert!(told("/dev/video12").contains(": /dev/video12; a camera is named v4l:12 "));
         assert!(told("/dev/camera").contains("a camera is named v4l:/dev/camera "));

@@ -33,7 +33,7 @@ pub const INSTALL_BRIDGE: &str = "install the package semidense-bridge (`apt ins
 /// Its command that writes the images of a topic to its standard output.
 const BRIDGE_COMMAND: &str = "ros2-camera";
 /// Maximum number of frames taken at a time: a sender that never pauses must not keep capture from its other work.
-const MAX_FRAMES_A_LOOK: usize = 8;
+const MAX_FRAMES_PER_POLL: usize = 8;
 
 /// Frames of another program, rectified: an endless source of the newest frame.
 pub struct StreamSource {
@@ -130,7 +130,7 @@ impl StreamSource {
     }
 
     /// Takes a sender that has connected, and everything that it has sent; returns the outcome.
-    fn look(&mut self, now: i64) -> Result<Arrival, SourceError> {
+    fn poll(&mut self, now: i64) -> Result<Arrival, SourceError> {
         match self.feed.connect(now) {
             Ok(Some(stream)) => self.take_sender(stream, now),
             Ok(None) => {}
@@ -179,12 +179,12 @@ impl StreamSource {
 
     /// Reads every complete frame and holds the newest valid one.
     fn drain(&mut self) -> Result<(), SourceError> {
-        for _ in 0..MAX_FRAMES_A_LOOK {
+        for _ in 0..MAX_FRAMES_PER_POLL {
             let Some(stream) = &mut self.stream else { return Ok(()) };
             match self.reader.read(stream) {
-                Ok(Progress::Frame(header)) => self.hold(header),
+                Ok(Progress::Frame(header)) => self.hold_frame(header),
                 Ok(Progress::Nothing) => return Ok(()),
-                Ok(Progress::Closed) => self.send_away(None),
+                Ok(Progress::Closed) => self.disconnect_sender(None),
                 Err(fault) => {
                     self.losses.broken += 1;
                     if matches!(fault, StreamFault::Size { .. }) && !self.has_streamed {
@@ -192,7 +192,7 @@ impl StreamSource {
                             self.failed(format!("{fault}; name a rig of that size with --rig"))
                         );
                     }
-                    self.send_away(Some(fault.to_string()));
+                    self.disconnect_sender(Some(fault.to_string()));
                 }
             }
         }
@@ -200,7 +200,7 @@ impl StreamSource {
     }
 
     /// Closes the stream. A sender's fault, unless it just disconnected, is reported until another sender connects.
-    fn send_away(&mut self, fault: Option<String>) {
+    fn disconnect_sender(&mut self, fault: Option<String>) {
         self.stream = None;
         self.feed.disconnected(nanos_of(ClockId::Monotonic));
         if let Some(fault) = &fault {
@@ -210,7 +210,7 @@ impl StreamSource {
     }
 
     /// Holds a complete frame, in place of one that was not read.
-    fn hold(&mut self, header: StreamHeader) {
+    fn hold_frame(&mut self, header: StreamHeader) {
         let arrival_nanos = nanos_of(ClockId::Monotonic);
         self.newest_nanos = arrival_nanos;
         self.fault = None;
@@ -270,7 +270,7 @@ impl FrameSource for StreamSource {
 
     fn await_frame(&mut self, wake: BorrowedFd<'_>, millis: u32) -> Result<Arrival, SourceError> {
         let now = nanos_of(ClockId::Monotonic);
-        if self.look(now)? == Arrival::Frame {
+        if self.poll(now)? == Arrival::Frame {
             return Ok(Arrival::Frame);
         }
         let retry_millis = self.feed.retry_nanos().filter(|_| self.stream.is_none()).map(|retry| {
@@ -280,7 +280,7 @@ impl FrameSource for StreamSource {
         let descriptors = [Some(wake), self.feed.descriptor(), stream];
         let millis = millis.min(retry_millis.unwrap_or(u32::MAX));
         await_readable(descriptors.into_iter().flatten(), millis);
-        self.look(nanos_of(ClockId::Monotonic))
+        self.poll(nanos_of(ClockId::Monotonic))
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
@@ -289,7 +289,7 @@ impl FrameSource for StreamSource {
             if let Some(held) = self.held.take() {
                 break held;
             }
-            match self.look(nanos_of(ClockId::Monotonic))? {
+            match self.poll(nanos_of(ClockId::Monotonic))? {
                 Arrival::Frame => {}
                 Arrival::Absent(reason) if self.stream.is_none() && self.has_streamed => {
                     return Err(self.failed(reason));

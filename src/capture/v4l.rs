@@ -27,7 +27,7 @@ use std::path::Path;
 
 use self::connection::Camera;
 use self::device::Kernel;
-use self::negotiation::Wish;
+use self::negotiation::StreamRequest;
 use self::params::CameraParams;
 use self::video_device::VideoSystem;
 use crate::capture::rectifier::Rectifier;
@@ -36,7 +36,7 @@ use crate::capture::source::{Arrival, FrameLosses, FrameSource, FrameStamp, Noti
 use crate::capture::source_error::SourceError;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
-pub use self::pixel_format::{BrokenPicture, PixelFormat};
+pub use self::pixel_format::{InvalidPicture, PixelFormat};
 
 /// Timeout of each wait by a reader that has not awaited the frame, milliseconds.
 pub(in crate::capture) const READ_MILLIS: u32 = 1000;
@@ -75,13 +75,13 @@ impl<S: VideoSystem> CameraSource<S> {
         let rectifier = Rectifier::new(rig, rig_path)?;
         let Intrinsics { width, height, .. } = rectifier.intrinsics();
         let own_rate = (params.rate_hz > 0.0).then_some(params.rate_hz);
-        let wish = Wish {
+        let requested = StreamRequest {
             width: width as u32,
             height: height as u32,
             format: params.format.format(),
             rate_hz: own_rate.or(rig.rate_hz),
         };
-        let camera = Camera::new(system, name.to_owned(), params.clone(), wish);
+        let camera = Camera::new(system, name.to_owned(), params.clone(), requested);
         Ok(Self { name: format!("v4l:{name}"), camera, rectifier })
     }
 
@@ -90,7 +90,7 @@ impl<S: VideoSystem> CameraSource<S> {
     }
 
     /// Converts the held frame; the error says why it is not a picture.
-    fn convert(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, BrokenPicture> {
+    fn convert(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, InvalidPicture> {
         let Some((held, grant, bytes)) = self.camera.held() else { return Ok(None) };
         self.rectifier.unpack_into(grant.format, bytes, grant.stride, pixels)?;
         Ok(Some(held.stamp))

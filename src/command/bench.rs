@@ -18,7 +18,7 @@ use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::atomic_file::write_atomically;
 use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
-use crate::service::latency_bench::{Disturbance, Measurement, Trial, TrialError, try_out};
+use crate::service::latency_bench::{Disturbance, Measurement, Trial, TrialError, run_trial};
 use crate::service::mode::Mode;
 use crate::service::results::times::Percentiles;
 use crate::service::shutdown::Shutdown;
@@ -222,7 +222,7 @@ fn run_latency(
             }
             let display = start_display(arguments.json)?;
             let options = common.without_instance().to_arguments();
-            let tried = try_out(config, &trial, &source, &options, log, &shutdown, &mut |p| {
+            let tried = run_trial(config, &trial, &source, &options, log, &shutdown, &mut |p| {
                 display.show(p)
             });
             display.finish();

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use crate::command::print::print;
 use crate::command::{CommandResult, CommonArguments};
-use crate::service::config::{Config, KeyInForce, Origin};
+use crate::service::config::{Config, EffectiveKey, Origin};
 
 /// Print the effective configuration, and where each value comes from
 ///
@@ -33,7 +33,7 @@ pub struct ConfigArguments {
 
 /// Prints the keys.
 pub fn run(common: &CommonArguments, arguments: &ConfigArguments) -> CommandResult {
-    let keys = Config::keys_in_force(common.file().as_deref(), &common.settings())?;
+    let keys = Config::effective_keys(common.file().as_deref(), &common.settings())?;
     let wanted = arguments.wanted(&keys);
     let text = match arguments.json {
         true => format!("{}\n", Value::Object(wanted.iter().map(|key| as_json(key)).collect())),
@@ -45,8 +45,8 @@ pub fn run(common: &CommonArguments, arguments: &ConfigArguments) -> CommandResu
 
 impl ConfigArguments {
     /// The keys to print.
-    fn wanted<'a>(&self, keys: &'a [KeyInForce]) -> Vec<&'a KeyInForce> {
-        let is_wanted = |key: &&KeyInForce| match self.changed {
+    fn wanted<'a>(&self, keys: &'a [EffectiveKey]) -> Vec<&'a EffectiveKey> {
+        let is_wanted = |key: &&EffectiveKey| match self.changed {
             true => key.built_in.is_some(),
             false => self.all || !key.is_expert,
         };
@@ -56,7 +56,7 @@ impl ConfigArguments {
 
 /// `key = value   # origin`, below the table that the key belongs to. A table may be opened only once, and
 /// keys without a table must precede the first.
-fn as_toml(keys: &[&KeyInForce]) -> String {
+fn as_toml(keys: &[&EffectiveKey]) -> String {
     /// Column of the origins where lines are short enough.
     const ORIGIN_COLUMN: usize = 40;
     let mut tables = vec![("", String::new())];
@@ -86,7 +86,7 @@ fn name_of(origin: &Origin) -> String {
     }
 }
 
-fn as_json(key: &KeyInForce) -> (String, Value) {
+fn as_json(key: &EffectiveKey) -> (String, Value) {
     // TOML values that JSON has too, except for numbers that are not finite.
     let value =
         |text: &str| -> Value { serde_json::from_str(text).unwrap_or_else(|_| json!(text)) };
@@ -118,7 +118,7 @@ mod tests {
             (false, true, Some(file.as_path()), both),
             (false, true, None, Vec::new()),
         ] {
-            let keys = Config::keys_in_force(file, &settings).unwrap();
+            let keys = Config::effective_keys(file, &settings).unwrap();
             let arguments = ConfigArguments { all, changed, json: false };
             let text = as_toml(&arguments.wanted(&keys));
             let saved = folder.path().join("saved.toml");

@@ -61,7 +61,7 @@ impl Ending<'_> {
         if !keeps_earlier {
             results
                 .write(output, self.write_more)
-                .map_err(|error| not_written(&error, output, journal.as_ref()))?;
+                .map_err(|error| not_written_text(&error, output, journal.as_ref()))?;
         }
         if is_tracked && !keeps_earlier {
             self.output.become_latest().unwrap_or_else(|error| {
@@ -101,7 +101,7 @@ impl Ending<'_> {
         }
         // With the summary as JSON, standard output does not name the results folder.
         let place = Some(where_to).filter(|_| self.json);
-        if let Some(words) = last_words(ended, untracked, place) {
+        if let Some(words) = closing_text(ended, untracked, place) {
             note(&words);
         }
         Ok(match ended {
@@ -130,7 +130,7 @@ impl Ending<'_> {
 }
 
 /// How a run ended if not normally, and the `place` of its results.
-fn last_words(ended: &EndOfRun, untracked: Option<&str>, place: Option<&str>) -> Option<String> {
+fn closing_text(ended: &EndOfRun, untracked: Option<&str>, place: Option<&str>) -> Option<String> {
     let how = match (ended, untracked) {
         (EndOfRun::Interrupted, None) => "interrupted".to_owned(),
         (EndOfRun::Interrupted, Some(why)) => {
@@ -146,7 +146,7 @@ fn last_words(ended: &EndOfRun, untracked: Option<&str>, place: Option<&str>) ->
 }
 
 /// The message for results that could not be written: nothing is lost.
-fn not_written(error: &ResultsError, output: &Path, journal: Option<&Journal>) -> String {
+fn not_written_text(error: &ResultsError, output: &Path, journal: Option<&Journal>) -> String {
     let Some(journal) = journal else { return error.to_string() };
     format!(
         "{error}; {} is unchanged and the journal of this run is in {}: `{}` writes its results",
@@ -171,7 +171,7 @@ fn recover_command(output: &Path, beside: bool) -> String {
 }
 
 /// Prints where the journals of killed runs are and the command that recovers them.
-pub fn note_unfinished(found: &[Unfinished]) {
+pub fn print_unfinished(found: &[Unfinished]) {
     for unfinished in found {
         note(&format!(
             "a run was killed before its results were written; its journal is {}: write them with `{}`",

@@ -10,7 +10,7 @@ use crate::capture::opening::open;
 use crate::capture::source::{FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
 use crate::capture::source_name::SourceName;
-use crate::command::ending::{Ending, note_unfinished};
+use crate::command::ending::{Ending, print_unfinished};
 use crate::command::map_points::MapPointOptions;
 use crate::command::print::note;
 use crate::command::{CommandResult, NOTHING_TRACKED};
@@ -158,7 +158,7 @@ fn find(place: &Place, folder: Option<&Path>) -> Result<Unfinished, Box<dyn Erro
             place.instance
         ),
     })?;
-    note_unfinished(&found);
+    print_unfinished(&found);
     Ok(newest)
 }
 

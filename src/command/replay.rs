@@ -12,7 +12,7 @@ use crate::capture::source::FrameSource;
 use crate::capture::source_name::SourceName;
 use crate::command::INTERRUPTED;
 use crate::command::capture::SourceArguments;
-use crate::command::ending::{Ending, journal_options, note_unfinished};
+use crate::command::ending::{Ending, journal_options, print_unfinished};
 use crate::command::map::MapOptions;
 use crate::command::map_points::MapPointOptions;
 use crate::command::print::{PrintError, note};
@@ -91,7 +91,7 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
     if let Some(file) = foreign_debug(output.path()).filter(|_| args.debug_images) {
         return Err(ResultsError::Foreign(file).into());
     }
-    note_unfinished(&unfinished(Some(&place), output.path()));
+    print_unfinished(&unfinished(Some(&place), output.path()));
     let mut source = open(&name, rig.as_deref(), &config.source_params())?;
     for remark in rig_remarks(&name, rig.as_deref()) {
         note(&format!("warning: {remark}"));
@@ -170,15 +170,15 @@ fn record(
     shutdown: &Shutdown,
     begin_journal: &dyn Fn() -> io::Result<ReplayJournal>,
 ) -> Result<Option<Replayed>, Box<dyn Error>> {
-    let goes_on = || !shutdown.is_requested();
+    let should_continue = || !shutdown.is_requested();
     let mut preparing: Option<Progress> = None;
     source.prepare(&mut |done, total| {
         let progress = preparing.get_or_insert_with(|| Progress::new("preparing", Some(total)));
         progress.update(done, "");
-        goes_on()
+        should_continue()
     })?;
     preparing.iter().for_each(Progress::finish);
-    if !goes_on() {
+    if !should_continue() {
         return Ok(None);
     }
     let config = replay_config(config, args);
@@ -194,12 +194,12 @@ fn record(
     let replayed = replay(source, source_name, &config, &mut |frame| {
         progress.update(frame.done, frame.state.name());
         journal.iter_mut().for_each(|journal| journal.observe(frame));
-        goes_on()
+        should_continue()
     });
     progress.finish();
     let journal = journal.map(ReplayJournal::into_journal);
     let (record, ended) = match replayed {
-        Ok(record) if goes_on() => (record, EndOfRun::Finished),
+        Ok(record) if should_continue() => (record, EndOfRun::Finished),
         Ok(record) => (record, EndOfRun::Interrupted),
         Err(error) => {
             let fault = error.to_string();

@@ -11,7 +11,7 @@ use clap::Args;
 use crate::capture::source_name::SourceName;
 use crate::command::bridge::bridge;
 use crate::command::capture::{ModeArguments, SourceArguments, usual_mode};
-use crate::command::ending::{Ending, journal_options, note_unfinished};
+use crate::command::ending::{Ending, journal_options, print_unfinished};
 use crate::command::map::MapOptions;
 use crate::command::map_points::MapPointOptions;
 use crate::command::print::note;
@@ -85,7 +85,7 @@ pub fn run(
         },
         (_, rig) => rig,
     };
-    note_unfinished(&unfinished(Some(&place), output.path()));
+    print_unfinished(&unfinished(Some(&place), output.path()));
     let mut journal = journal_options(config, &source, rig.as_deref(), output.path());
     journal.start.mode = if mode == Mode::Live { RunMode::Live } else { RunMode::Lockstep };
     let options = RunOptions {
@@ -99,7 +99,7 @@ pub fn run(
         log: log.clone(),
     };
     let page = arguments.view.map(|at| start_page(at, common, &place, log)).transpose()?;
-    let mut outcome = supervise_shown(config, &options, &shutdown, page, arguments.json)?;
+    let mut outcome = supervise_with_display(config, &options, &shutdown, page, arguments.json)?;
     if outcome.record.poses.is_empty() && outcome.record.ended != EndOfRun::Finished {
         return end_without_results(outcome);
     }
@@ -124,7 +124,7 @@ fn child_arguments(
 }
 
 /// Supervises the processes under a progress display that names the live page once it is served.
-fn supervise_shown(
+fn supervise_with_display(
     config: &Config,
     options: &RunOptions,
     shutdown: &Shutdown,
@@ -134,7 +134,7 @@ fn supervise_shown(
     let display = start_display(json)?;
     let outcome = supervise(config, options, shutdown, &mut |progress| {
         display.show(progress);
-        if let Some(address) = page.as_mut().and_then(ViewChild::look) {
+        if let Some(address) = page.as_mut().and_then(ViewChild::poll) {
             note(&format!("live page: {address}"));
         }
     });

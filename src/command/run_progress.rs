@@ -15,7 +15,7 @@ use crate::slam::pose::TrackingState;
 
 /// Starts the thread that shows the progress of a run: nothing if `is_quiet`, else what suits the terminal.
 pub fn start_display(is_quiet: bool) -> io::Result<ProgressThread> {
-    let mut shown = Shown::new(is_quiet);
+    let mut shown = Display::new(is_quiet);
     ProgressThread::start(move |progress| match progress {
         Some(progress) => shown.show(progress),
         None => shown.finish(),
@@ -24,7 +24,7 @@ pub fn start_display(is_quiet: bool) -> io::Result<ProgressThread> {
 
 /// What the user is shown.
 #[derive(Debug)]
-struct Shown {
+struct Display {
     bar: Option<ProgressBar>,
     is_quiet: bool,
     /// When the last plain line was printed, or the run started.
@@ -38,7 +38,7 @@ const WITH_END: &str = "{prefix:9} {bar:40} {pos}/{len} {msg}";
 /// Template for a camera.
 const WITHOUT_END: &str = "{prefix:9} {pos} frames, {msg}";
 
-impl Shown {
+impl Display {
     fn new(is_quiet: bool) -> Self {
         let is_shown = !is_quiet && std::io::stderr().is_terminal();
         let bar = is_shown.then(|| ProgressBar::new(0).with_style(style(WITH_END)));

@@ -10,7 +10,7 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use crate::command::CommandResult;
-use crate::command::ending::note_unfinished;
+use crate::command::ending::print_unfinished;
 use crate::command::print::print;
 use crate::command::status_text::{legend, status_text};
 use crate::service::checkpoint::read_checkpoint;
@@ -64,12 +64,12 @@ pub struct StatusArguments {
 /// Prints the status.
 pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
     let place = Place::new(&config.instance, &config.root)?;
-    note_unfinished(&unfinished(Some(&place), Path::new(".")));
+    print_unfinished(&unfinished(Some(&place), Path::new(".")));
     let shutdown = Shutdown::install()?;
     loop {
         match follow(&place, &arguments, &shutdown) {
             Err(error) if arguments.watch && is_absence(error.as_ref()) => {
-                let look = format!("{}\n", nothing_runs(&place.instance));
+                let look = format!("{}\n", not_running_json(&place.instance));
                 let text = format!("{}{error}\n", clear(&arguments));
                 print(if arguments.json { &look } else { &text })?;
             }
@@ -107,7 +107,7 @@ fn follow(
         if shutdown.is_requested() {
             break;
         }
-        let look = watch.look(&hub)?;
+        let look = watch.snapshot(&hub)?;
         let has_ended = look["ended"] == true;
         if arguments.once && looks < MAX_LOOKS && !watch.is_complete(&look) {
             continue;
@@ -128,7 +128,7 @@ fn follow(
 }
 
 /// The status when nothing runs.
-fn nothing_runs(instance: &str) -> Value {
+fn not_running_json(instance: &str) -> Value {
     json!({
         "instance": instance, "source": null, "uptime_secs": null, "keyframes": null, "capture": null, "tracker": null,
         "mapper": null, "pose": null, "ended": true,
@@ -172,7 +172,7 @@ impl<'a> Watch<'a> {
     }
 
     /// One update.
-    fn look(&mut self, hub: &Hub) -> Result<Value, Box<dyn Error>> {
+    fn snapshot(&mut self, hub: &Hub) -> Result<Value, Box<dyn Error>> {
         let mut look = json!({ "instance": self.place.instance, "source": null, "uptime_secs": null, "keyframes": null });
         let now = now_nanos();
         let (mut heard, mut ended) = (0, 0);
@@ -214,7 +214,7 @@ impl<'a> Watch<'a> {
         if look["keyframes"].is_null() {
             look["keyframes"] = json!(self.keyframes_of_checkpoint());
         }
-        self.hear_poses(hub)?;
+        self.receive_poses(hub)?;
         look["pose"] = self.last_pose.as_ref().map_or(Value::Null, |pose| pose_row(pose, now));
         look["ended"] = json!(heard > 0 && ended == heard);
         Ok(look)
@@ -227,7 +227,7 @@ impl<'a> Watch<'a> {
     }
 
     /// Keeps the newest pose.
-    fn hear_poses(&mut self, hub: &Hub) -> Result<(), Box<dyn Error>> {
+    fn receive_poses(&mut self, hub: &Hub) -> Result<(), Box<dyn Error>> {
         if self.poses.is_none() {
             self.poses = unless_absent(hub.subscriber(&POSE))?;
         }

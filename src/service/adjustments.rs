@@ -69,7 +69,7 @@ pub struct SearchRecord {
 
 /// The estimate in flight, and the state of the map it was taken from.
 #[derive(Debug, Clone, Copy)]
-struct Away {
+struct InFlight {
     /// Frames counted when it began.
     began: u64,
     epoch: u32,
@@ -84,7 +84,7 @@ pub struct Adjustments {
     entry: Entry,
     /// `None` where joint estimation is switched off or has failed.
     thread: Option<AdjustmentThread>,
-    away: Option<Away>,
+    in_flight: Option<InFlight>,
     /// Frames so far, and the sequence of the last.
     frames: u64,
     sequence: u64,
@@ -104,7 +104,7 @@ impl Adjustments {
         Ok(Self {
             entry,
             thread,
-            away: None,
+            in_flight: None,
             frames: 0,
             sequence: 0,
             records: Vec::new(),
@@ -113,8 +113,8 @@ impl Adjustments {
         })
     }
 
-    /// Readable when an estimate is ready: then call [`Adjustments::pick_up`]. `None` where that lets nothing in, as a
-    /// wait on it would return at once over and over.
+    /// Readable when an estimate is ready: then call [`Adjustments::apply_ready`]. `None` where that lets nothing in,
+    /// as a wait on it would return at once over and over.
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
         let thread = self.thread.as_ref().filter(|_| self.entry == Entry::WhenReady);
         thread.map(AdjustmentThread::descriptor)
@@ -140,18 +140,18 @@ impl Adjustments {
     pub fn after_frame(&mut self, mapper: &mut Mapper, sequence: u64) -> StepOutcome {
         self.frames += 1;
         self.sequence = sequence;
-        let before = self.let_in(mapper);
+        let before = self.apply_due(mapper);
         self.begin(mapper);
         // With a delay of 0 frames an estimate is due with its own frame.
-        joined(before, self.let_in(mapper))
+        merged_outcome(before, self.apply_due(mapper))
     }
 
     /// Between two frames: lets in what is ready, unless it enters at a fixed frame.
-    pub fn pick_up(&mut self, mapper: &mut Mapper) -> StepOutcome {
+    pub fn apply_ready(&mut self, mapper: &mut Mapper) -> StepOutcome {
         match self.entry {
             Entry::AfterFrames(_) => StepOutcome::default(),
             Entry::WhenReady => {
-                let outcome = self.let_in(mapper);
+                let outcome = self.apply_due(mapper);
                 self.begin(mapper);
                 outcome
             }
@@ -165,26 +165,26 @@ impl Adjustments {
         let deadline = is_live.then(|| Instant::now() + LAST_ADJUSTMENTS);
         let left =
             || deadline.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
-        let mut outcome = self.let_in_within(mapper, left());
+        let mut outcome = self.apply_within(mapper, left());
         while !left().is_zero() {
             self.begin_with(mapper, Mapper::begin_last_search);
-            if self.away.is_none() {
+            if self.in_flight.is_none() {
                 break;
             }
-            outcome = joined(outcome, self.let_in_within(mapper, left()));
+            outcome = merged_outcome(outcome, self.apply_within(mapper, left()));
         }
         self.begin_with(mapper, Mapper::begin_last_adjustment);
-        outcome = joined(outcome, self.let_in_within(mapper, left()));
+        outcome = merged_outcome(outcome, self.apply_within(mapper, left()));
         while !left().is_zero() && mapper.refine_depth() {
             outcome.graph_changed = true;
         }
-        mapper.keep_confirmed();
+        mapper.store_confirmed_points();
         outcome
     }
 
     /// The mapper is replaced by one for another camera: the estimate in flight is of no use to it.
-    pub fn orphan(&mut self) {
-        self.away.iter_mut().for_each(|away| away.is_orphan = true);
+    pub fn abandon(&mut self) {
+        self.in_flight.iter_mut().for_each(|in_flight| in_flight.is_orphan = true);
     }
 
     /// Hands over what is new, unless an estimate is in flight.
@@ -199,9 +199,9 @@ impl Adjustments {
         mapper: &mut Mapper,
         begin: impl FnOnce(&mut Mapper) -> Option<Box<Window>>,
     ) {
-        let (None, Some(thread)) = (self.away, &self.thread) else { return };
+        let (None, Some(thread)) = (self.in_flight, &self.thread) else { return };
         let Some(window) = begin(mapper) else { return };
-        self.away = Some(Away {
+        self.in_flight = Some(InFlight {
             began: self.frames,
             epoch: mapper.keyframe().map_or(0, |keyframe| keyframe.epoch),
             map_revision: mapper.map().revision,
@@ -212,22 +212,22 @@ impl Adjustments {
     }
 
     /// Lets in what is due.
-    fn let_in(&mut self, mapper: &mut Mapper) -> StepOutcome {
-        let timeout = match (self.entry, &self.away) {
-            (Entry::AfterFrames(frames), Some(away))
-                if self.frames < away.began.saturating_add(frames) =>
+    fn apply_due(&mut self, mapper: &mut Mapper) -> StepOutcome {
+        let timeout = match (self.entry, &self.in_flight) {
+            (Entry::AfterFrames(frames), Some(in_flight))
+                if self.frames < in_flight.began.saturating_add(frames) =>
             {
                 return StepOutcome::default();
             }
             (Entry::AfterFrames(_), _) => Duration::MAX,
             (Entry::WhenReady, _) => Duration::ZERO,
         };
-        self.let_in_within(mapper, timeout)
+        self.apply_within(mapper, timeout)
     }
 
     /// Lets in the estimate in flight if it comes back within `timeout`.
-    fn let_in_within(&mut self, mapper: &mut Mapper, timeout: Duration) -> StepOutcome {
-        let (Some(away), Some(thread)) = (self.away, &self.thread) else {
+    fn apply_within(&mut self, mapper: &mut Mapper, timeout: Duration) -> StepOutcome {
+        let (Some(in_flight), Some(thread)) = (self.in_flight, &self.thread) else {
             return StepOutcome::default();
         };
         let mut finished = match thread.wait_at_most(timeout) {
@@ -238,19 +238,19 @@ impl Adjustments {
                 return StepOutcome::default();
             }
         };
-        self.away = None;
-        let fate = fate(mapper, &away);
+        self.in_flight = None;
+        let fate = fate(mapper, &in_flight);
         if let Some(report) = finished.window.loops.take_report() {
             let (sequence, nanos) = (self.sequence, finished.nanos);
             self.searches.push(SearchRecord { sequence, nanos, report });
         }
         if let Some(adjustment) = finished.adjustment {
-            let frames = self.frames.saturating_sub(away.began);
+            let frames = self.frames.saturating_sub(in_flight.began);
             let (sequence, nanos) = (self.sequence, finished.nanos);
             self.records.push(AdjustmentRecord { sequence, frames, nanos, fate, adjustment });
         }
         match fate {
-            _ if away.is_orphan => StepOutcome::default(),
+            _ if in_flight.is_orphan => StepOutcome::default(),
             Fate::Dropped => {
                 mapper.drop_adjustment(finished.window);
                 StepOutcome::default()
@@ -261,7 +261,7 @@ impl Adjustments {
 
     /// The thread has panicked: keyframes are no longer estimated jointly.
     fn give_up(&mut self) {
-        self.away = None;
+        self.in_flight = None;
         let message = self.thread.take().map(AdjustmentThread::panic_message).unwrap_or_default();
         let failure = format!(
             "the joint estimation of keyframes has failed ({message}); mapping continues without it, and drifts more: please report this"
@@ -276,14 +276,14 @@ fn newest(mapper: &Mapper) -> Option<u64> {
 }
 
 /// The fate of an estimate, given the current map.
-fn fate(mapper: &Mapper, away: &Away) -> Fate {
+fn fate(mapper: &Mapper, in_flight: &InFlight) -> Fate {
     let is_same_map = mapper.keyframe().is_some_and(|active| {
-        active.epoch == away.epoch
+        active.epoch == in_flight.epoch
             && active.map_state == MapState::Established
             // Otherwise another correction has moved its keyframes.
-            && mapper.map().revision == away.map_revision
+            && mapper.map().revision == in_flight.map_revision
     });
-    match (is_same_map && !away.is_orphan, newest(mapper) == away.newest) {
+    match (is_same_map && !in_flight.is_orphan, newest(mapper) == in_flight.newest) {
         (false, _) => Fate::Dropped,
         (true, false) => Fate::Merged,
         (true, true) => Fate::Entered,
@@ -291,7 +291,7 @@ fn fate(mapper: &Mapper, away: &Away) -> Fate {
 }
 
 /// What is to be published after both steps.
-fn joined(one: StepOutcome, other: StepOutcome) -> StepOutcome {
+fn merged_outcome(one: StepOutcome, other: StepOutcome) -> StepOutcome {
     StepOutcome {
         keyframe_changed: one.keyframe_changed || other.keyframe_changed,
         graph_changed: one.graph_changed || other.graph_changed,

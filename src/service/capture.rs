@@ -13,7 +13,7 @@ use crate::service::config::Config;
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
-use crate::service::position::{Position, PositionKeeper, Predecessor};
+use crate::service::position::{Position, PositionRecorder, Predecessor};
 use crate::service::refused_images::RefusedImages;
 use crate::service::run_error::RunError;
 use crate::service::schedule::apply;
@@ -52,14 +52,14 @@ pub fn run(config: &Config, options: &CaptureOptions, shutdown: &Shutdown) -> Re
         // After the preparation: rendering a simulated world has no deadline.
         let refusals = apply(&config.capture.scheduling);
         refusals.iter().for_each(|refusal| tracing::warn!("capture: {refusal}"));
-        shell.health.tell_scheduling(&refusals);
-        shell.health.tell_ready();
+        shell.health.report_scheduling(&refusals);
+        shell.health.notify_ready();
         shell.stream()
     });
     // A supervisor that did not request the end starts another capture, which continues from here.
     let is_asked = matches!(outcome, Err(RunError::Interrupted)) && !is_supervised();
     if outcome.is_ok() || is_asked {
-        shell.position.end_in_order();
+        shell.position.remove_on_drop();
     }
     let left_out = shell.refused.text();
     shell.health.end(&outcome, left_out.as_deref().unwrap_or("the source has ended"));
@@ -85,7 +85,7 @@ struct Shell<'a> {
     frames: Publisher<u8, FrameHeader>,
     steps: Subscriber<StepMessage, ()>,
     /// Live: the position in the source, for a successor; capture works without the file too.
-    position: PositionKeeper,
+    position: PositionRecorder,
     /// Where a capture of the same run died.
     left: Option<Position>,
     /// Until the first frame, where no earlier capture is on record: the poses of a tracker that already runs.
@@ -133,11 +133,11 @@ impl<'a> Shell<'a> {
         place.check_shared_memory(shared_memory_bytes(&intrinsics, Some("capture")))?;
         let hub = Hub::join(&place, "capture", Access::Member)?;
         let (source_name, path) = (options.source.to_string(), place.position_path());
-        let (position, left) = PositionKeeper::of_run(&path, options.mode, &source_name, rig);
+        let (position, left) = PositionRecorder::of_run(&path, options.mode, &source_name, rig);
         // A supervisor keeps track of earlier captures; without one the tracker is queried too.
         let asks_tracker = options.mode == Mode::Live && left.is_none() && !is_supervised();
         let mut health = Health::open(&hub, &CAPTURE_HEALTH)?;
-        health.tell_source(&options.source.to_string());
+        health.set_source(&options.source.to_string());
         health.counters().total = source.num_frames().unwrap_or(0) as u64;
         let shell = Self {
             config,
@@ -186,7 +186,7 @@ impl<'a> Shell<'a> {
             health.progress(done, total);
             !shutdown.is_requested()
         })?;
-        self.go_on_after_another()?;
+        self.continue_from_predecessor()?;
         self.health.enter(ProcessState::Ready, "");
         if !self.is_recorded() {
             return Ok(());
@@ -209,24 +209,24 @@ impl<'a> Shell<'a> {
 
     /// Continues after another capture that died: a recording after its last frame, a camera's numbers after its last
     /// number. Neither sequences nor stamps go back.
-    fn go_on_after_another(&mut self) -> Result<(), RunError> {
+    fn continue_from_predecessor(&mut self) -> Result<(), RunError> {
         if let Some(left) = self.left {
             self.predecessor.last_nanos = Some(left.capture_nanos);
-            return self.go_on_behind(left.sequence);
+            return self.continue_behind(left.sequence);
         }
         let Some(poses) = self.poses.take() else { return Ok(()) };
         let deadline = now_nanos().saturating_add(LAST_POSE_NANOS);
         while now_nanos() < deadline {
             let newest = poses.newest()?;
             if let Some(pose) = newest.as_ref().and_then(|message| message.payload().first()) {
-                return self.go_on_behind(pose.sequence);
+                return self.continue_behind(pose.sequence);
             }
             self.pause(LAST_POSE_PAUSE)?;
         }
         Ok(())
     }
 
-    fn go_on_behind(&mut self, sequence: u64) -> Result<(), RunError> {
+    fn continue_behind(&mut self, sequence: u64) -> Result<(), RunError> {
         if self.is_recorded() {
             self.source.skip_to(sequence)?;
         } else {
@@ -311,7 +311,7 @@ impl<'a> Shell<'a> {
             Ok(None) => {
                 return self.refused.error().map_or(Ok(Sent::End), |error| Err(error.into()));
             }
-            Err(error) if error.is_passing() && !self.ends_at(&error) => {
+            Err(error) if error.is_transient() && !self.ends_at(&error) => {
                 self.refuse(&error);
                 return Ok(Sent::Nothing);
             }
@@ -347,7 +347,7 @@ impl<'a> Shell<'a> {
         count(self.health.counters(), &mut self.next_sequence, &stamp);
         // Before sending: a frame lost between the two is better than one sent twice.
         let counters = self.health.counters();
-        self.position.note_or_warn(&Position::at(&stamp, counters.frames, counters.gaps));
+        self.position.write_or_warn(&Position::at(&stamp, counters.frames, counters.gaps));
         let header = self.header(&stamp, clock_nanos);
         if self.mode == Mode::Live {
             // A deadline counts from the arrival: lateness before that is recorded here.

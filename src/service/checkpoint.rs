@@ -67,7 +67,7 @@ impl Kept {
         let is_corrected = outcome.graph_changed && !outcome.needs_image();
         let is_new = outcome.needs_image() || is_corrected;
         let mut is_left = false;
-        while let Some(keyframe) = mapper.take_left() {
+        while let Some(keyframe) = mapper.take_keyframe_to_save() {
             self.checkpoint.put_keyframe(keyframe.clone());
             is_left = true;
         }
@@ -88,7 +88,7 @@ impl Kept {
     }
 
     /// No process needs to continue from here: the files are removed on drop.
-    pub fn end_in_order(&mut self) {
+    pub fn remove_on_drop(&mut self) {
         self.checkpoint.is_over = true;
     }
 }

@@ -32,9 +32,9 @@ const FRAMES_ON_STDIN: &str = "stdin";
 /// Prefix of the last line of a command that fails.
 pub const ERROR_PREFIX: &str = "error: ";
 /// Longest wait for a killed process to end: one that the kernel does not release, as in a hanging driver, is left.
-const LONGEST_DEATH: Duration = Duration::from_secs(2);
+const KILL_TIMEOUT: Duration = Duration::from_secs(2);
 /// Longest wait after a process's end for its last lines: another process may hold its standard error.
-const LAST_WORDS: Duration = Duration::from_secs(1);
+const LAST_LINES_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Why a supervised process must not start.
 #[derive(Debug, thiserror::Error)]
@@ -62,8 +62,8 @@ pub fn prepared_frames() -> Option<File> {
 
 /// Memory for frames that are prepared before a live run and may be needed by more than one capture.
 pub fn memory_for_frames(source: &SourceName, mode: Mode) -> Option<File> {
-    let prepares = matches!(source, SourceName::Simulator { .. } | SourceName::Looped { .. });
-    if !prepares || mode != Mode::Live {
+    let extend_start = matches!(source, SourceName::Simulator { .. } | SourceName::Looped { .. });
+    if !extend_start || mode != Mode::Live {
         return None;
     }
     let memory = rustix::fs::memfd_create("semidense-frames", MemfdFlags::CLOEXEC);
@@ -91,10 +91,10 @@ pub fn follow_supervisor() -> Result<(), FollowError> {
 /// and until then it cannot be told from a living one.
 pub fn tidy_up(place: &Place) {
     /// Longest time until a killed process is gone, on a busy machine with a slow disk.
-    const LONGEST_DEATH: Duration = Duration::from_secs(10);
+    const KILL_TIMEOUT: Duration = Duration::from_secs(10);
     let supervisor = std::env::var(SUPERVISOR_VARIABLE).ok().and_then(|pid| pid.parse().ok());
     if let Some(supervisor) = supervisor {
-        wait_at_most(LONGEST_DEATH, || !is_ending(supervisor));
+        wait_at_most(KILL_TIMEOUT, || !is_ending(supervisor));
     }
     place.tidy();
 }
@@ -173,13 +173,13 @@ impl Child {
     /// Kills it and waits a bounded time for its end.
     pub fn kill(&mut self) {
         let _ = self.process.kill();
-        wait_at_most(LONGEST_DEATH, || !matches!(self.process.try_wait(), Ok(None)));
+        wait_at_most(KILL_TIMEOUT, || !matches!(self.process.try_wait(), Ok(None)));
     }
 
     /// Its error message, where it failed. Call after its end.
     pub fn fault(&mut self) -> Option<String> {
         if let Some(reader) = self.reader.take() {
-            wait_at_most(LAST_WORDS, || reader.is_finished());
+            wait_at_most(LAST_LINES_TIMEOUT, || reader.is_finished());
         }
         locked(&self.fault).take()
     }

@@ -18,7 +18,7 @@ use crate::capture::input_file;
 use crate::capture::opening::SourceParams;
 use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::v4l::params::CameraParams;
-pub use crate::service::config::origins::{KeyInForce, Origin};
+pub use crate::service::config::origins::{EffectiveKey, Origin};
 pub use crate::service::config_error::ConfigError;
 use crate::service::map_folder::depth_file::MapDetail;
 use crate::service::results::ResultsParams;

@@ -44,8 +44,10 @@ pub fn given_pose(
         estimate.epoch = keyframe.epoch;
         (estimate.revision, estimate.map_revision) = (keyframe.revision, keyframe.map_revision);
         estimate.keyframe_id = keyframe.keyframe_id;
-        estimate.keyframe_from_camera = keyframe.world_from_keyframe.locate(&world_from_camera);
-        estimate.map_from_camera = keyframe.map_from_keyframe.place(&estimate.keyframe_from_camera);
+        estimate.keyframe_from_camera =
+            keyframe.world_from_keyframe.inverse_transform_pose(&world_from_camera);
+        estimate.map_from_camera =
+            keyframe.map_from_keyframe.transform_pose(&estimate.keyframe_from_camera);
         (estimate.quality, estimate.proposes_keyframe) =
             view_of(keyframe, &estimate.keyframe_from_camera, tracker);
     }

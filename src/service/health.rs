@@ -3,8 +3,8 @@
 use crate::service::adjustments::{AdjustmentRecord, Fate};
 use crate::service::clock::now_nanos;
 use crate::service::manager_notice::ManagerNotice;
-use crate::service::schedule::{Policy, Refusal, in_force, peak_rss_bytes};
-use crate::slam::loops::SearchFate;
+use crate::service::schedule::{Policy, Refusal, active_scheduling, peak_rss_bytes};
+use crate::slam::loops::SearchOutcome;
 use crate::wire::command::{text_bytes, text_from_bytes};
 use crate::wire::message::{HISTOGRAM_BUCKETS, HealthMessage, TEXT_BYTES};
 use crate::wire::port::{Hub, OpenError, Publisher};
@@ -187,7 +187,7 @@ impl Health {
     }
 
     /// Sets the source of the frames; it is sent with the next report.
-    pub fn tell_source(&mut self, name: &str) {
+    pub fn set_source(&mut self, name: &str) {
         (self.message.source, self.message.source_bytes) = text_bytes(name);
     }
 
@@ -217,17 +217,17 @@ impl Health {
     }
 
     /// Counts a search for loops; one that proposes a loop continues.
-    pub fn count_search(&mut self, fate: &SearchFate) {
+    pub fn count_search(&mut self, fate: &SearchOutcome) {
         let of = &mut self.message;
         let count = match fate {
-            SearchFate::Proposed => return,
-            SearchFate::Closed => &mut of.loops_closed,
-            SearchFate::Held => &mut of.loops_held,
-            SearchFate::Joined => &mut of.epochs_joined,
-            SearchFate::Refused(_) => &mut of.loops_refused,
-            SearchFate::AgainstDrift(_) => &mut of.loops_against_drift,
-            SearchFate::Unconfirmed => &mut of.loops_unconfirmed,
-            SearchFate::Inconsistent => &mut of.loops_inconsistent,
+            SearchOutcome::Proposed => return,
+            SearchOutcome::Closed => &mut of.loops_closed,
+            SearchOutcome::AlreadyConsistent => &mut of.loops_held,
+            SearchOutcome::Joined => &mut of.epochs_joined,
+            SearchOutcome::Refused(_) => &mut of.loops_refused,
+            SearchOutcome::AgainstDrift(_) => &mut of.loops_against_drift,
+            SearchOutcome::Unconfirmed => &mut of.loops_unconfirmed,
+            SearchOutcome::Inconsistent => &mut of.loops_inconsistent,
         };
         *count += 1;
         of.loop_searches += 1;
@@ -241,18 +241,18 @@ impl Health {
     }
 
     /// Reports the scheduling in force for the calling thread, and the first refusal as text.
-    pub fn tell_scheduling(&mut self, refusals: &[Refusal]) {
-        let in_force = in_force();
-        self.message.scheduling = scheduling_code(in_force.policy);
-        self.message.priority = in_force.priority;
-        self.message.memory_locked = u32::from(in_force.memory_locked);
+    pub fn report_scheduling(&mut self, refusals: &[Refusal]) {
+        let active_scheduling = active_scheduling();
+        self.message.scheduling = scheduling_code(active_scheduling.policy);
+        self.message.priority = active_scheduling.priority;
+        self.message.memory_locked = u32::from(active_scheduling.memory_locked);
         self.warn(&refusals.first().map(Refusal::to_string).unwrap_or_default());
     }
 
     /// Enters a state and reports it at once.
     pub fn enter(&mut self, state: ProcessState, cause: &str) {
         let (cause, cause_bytes) = text_bytes(cause);
-        self.go_back_to((state.code(), cause, cause_bytes));
+        self.restore_state((state.code(), cause, cause_bytes));
     }
 
     /// Reports how the process ended: in order, for this cause, or with an error.
@@ -264,14 +264,14 @@ impl Health {
     }
 
     /// The state that was entered last.
-    pub fn entered(&self) -> StateAndCause {
+    pub fn current_state(&self) -> StateAndCause {
         let HealthMessage { state, cause, cause_bytes, .. } = self.message;
         (state, cause, cause_bytes)
     }
 
-    /// Enters a state obtained from [`Health::entered`].
-    pub fn go_back_to(&mut self, wanted: StateAndCause) {
-        if wanted == self.entered() {
+    /// Enters a state obtained from [`Health::current_state`].
+    pub fn restore_state(&mut self, wanted: StateAndCause) {
+        if wanted == self.current_state() {
             return;
         }
         (self.message.state, self.message.cause, self.message.cause_bytes) = wanted;
@@ -280,7 +280,7 @@ impl Health {
     }
 
     /// Tells the service manager that everything is open and read and that the process now does its work.
-    pub fn tell_ready(&mut self) {
+    pub fn notify_ready(&mut self) {
         self.notice.ready();
     }
 
@@ -290,7 +290,7 @@ impl Health {
         let due = now_nanos() - self.message.published_nanos >= PROGRESS_PERIOD_NANOS;
         self.changed |= due || done == total;
         if due {
-            self.notice.prepares();
+            self.notice.extend_start();
         }
         self.report();
     }
@@ -316,7 +316,7 @@ impl Health {
         if let Err(error) = self.publisher.send((), &[self.message]) {
             tracing::warn!("{error}");
         }
-        self.tell_status();
+        self.notify_status();
     }
 
     /// Computes the frames per second since the last computation, once that is a second ago.
@@ -330,7 +330,7 @@ impl Health {
     }
 
     /// Sends the state, its cause and the figures to the service manager as one line.
-    fn tell_status(&mut self) {
+    fn notify_status(&mut self) {
         let state = ProcessState::from_code(self.message.state).unwrap_or(ProcessState::Failed);
         if matches!(state, ProcessState::Finished | ProcessState::Failed) {
             self.notice.stopping();
@@ -421,11 +421,11 @@ mod tests {
         let hub = Hub::join(&place, "tracker", Access::Member).unwrap();
         let mut health = Health::open(&hub, &TRACKER_HEALTH).unwrap();
         let fates = [
-            SearchFate::Proposed,
-            SearchFate::Closed,
-            SearchFate::Held,
-            SearchFate::Held,
-            SearchFate::AgainstDrift(99.0),
+            SearchOutcome::Proposed,
+            SearchOutcome::Closed,
+            SearchOutcome::AlreadyConsistent,
+            SearchOutcome::AlreadyConsistent,
+            SearchOutcome::AgainstDrift(99.0),
         ];
         fates.iter().for_each(|fate| health.count_search(fate));
         let of = &health.message;

@@ -25,7 +25,7 @@ use std::time::{Duration, Instant};
 use crossbeam::channel::{SendTimeoutError, Sender, TrySendError, bounded};
 
 use crate::service::clock::wait_at_most;
-use crate::service::journal::folder::{Pointer, begin_folder, hold, remove_folder};
+use crate::service::journal::folder::{Pointer, begin_folder, lock, remove_folder};
 use crate::service::journal::log::{Record, RunStart, log_header, read_log};
 use crate::service::journal::recovered::read_map_of;
 use crate::service::journal::writer::{Entry, Writer};
@@ -89,7 +89,7 @@ impl Journal {
         let mut first = log_header();
         Record::Start(Box::new(options.start.clone())).write(&mut first);
         let writer = Writer::create(&folder, &first, options.max_depth_bytes)?;
-        let (held, on_disk) = (writer.hold()?, writer.poses_on_disk());
+        let (held, on_disk) = (writer.lock()?, writer.poses_on_disk());
         let (entries, received) = bounded(QUEUE);
         let thread = std::thread::Builder::new()
             .name("semidense-journal".to_owned())
@@ -105,7 +105,7 @@ impl Journal {
     /// Holds the journal that a killed run left in `folder`, so that no other process makes results from it; `None`
     /// where another process holds it.
     pub fn take_over(folder: &Path) -> io::Result<Option<Self>> {
-        let held = hold(&folder.join(folder::LOG))?;
+        let held = lock(&folder.join(folder::LOG))?;
         // The next search for its pointer removes the pointer.
         Ok(held.map(|held| Self::of(folder.to_owned(), held, None)))
     }
@@ -310,7 +310,7 @@ mod tests {
     /// A journal in `folder` without a pointer.
     fn journal(folder: &Path) -> Journal {
         let writer = Writer::create(folder, &log_header(), 1 << 20).unwrap();
-        let (held, on_disk) = (writer.hold().unwrap(), writer.poses_on_disk());
+        let (held, on_disk) = (writer.lock().unwrap(), writer.poses_on_disk());
         let (entries, received) = bounded(QUEUE);
         let thread = std::thread::spawn(move || writer.write_all(&received));
         let mut journal = Journal::of(folder.to_owned(), held, Some((entries, thread)));
@@ -324,7 +324,7 @@ mod tests {
         let mut journal = journal(folder.path());
         let mut recording = Recording::default();
         for sequence in 0..3000 {
-            recording.take_pose(&pose(sequence)).unwrap();
+            recording.add_pose(&pose(sequence)).unwrap();
             journal.append(&Record::Pose(Box::new(pose(sequence))));
             journal.append(&Record::Step(Step { step_nanos: 1, change_nanos: 0, start_frame: 0 }));
             if sequence == 2000 {
@@ -338,7 +338,7 @@ mod tests {
         let mut found = Vec::new();
         journal.read_poses(recording.num_released(), &mut |pose| found.push(*pose));
         assert_eq!(found, (0..2001).map(pose).collect::<Vec<_>>());
-        assert_eq!(recording.take_back(|take| journal.read_poses(2001, take)), 0);
+        assert_eq!(recording.restore_released(|take| journal.read_poses(2001, take)), 0);
         assert_eq!((recording.num_poses(), recording.num_released()), (3000, 0));
     }
 

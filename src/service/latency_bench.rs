@@ -144,7 +144,7 @@ pub enum TrialError {
 }
 
 /// Runs one trial. `source` is repeated; `arguments` are options for every process.
-pub fn try_out(
+pub fn run_trial(
     config: &Config,
     trial: &Trial,
     source: &SourceName,

@@ -35,11 +35,11 @@ impl Liveness {
 /// Whether the process with this id was killed or has exited and still releases its resources: the kernel closes its
 /// files, and with them its locks, when the last of its threads has ended.
 pub fn is_ending(process_id: u32) -> bool {
-    ends_by(&fs::read_to_string(format!("/proc/{process_id}/stat")).unwrap_or_default())
+    is_ending_by_stat(&fs::read_to_string(format!("/proc/{process_id}/stat")).unwrap_or_default())
 }
 
 /// From the contents of `/proc/ID/stat`.
-fn ends_by(stat: &str) -> bool {
+fn is_ending_by_stat(stat: &str) -> bool {
     const FLAGS: usize = 9;
     const NUM_THREADS: usize = 20;
     /// `PF_EXITING` of the kernel.
@@ -95,10 +95,12 @@ mod tests {
             format!("7 (a) b) {state} 1 7 7 0 -1 {flags} 0 0 0 0 0 0 0 0 20 0 {threads} 0 4711 0 0")
         };
         let (usual, exiting) = (4_194_560, 4_194_564);
-        assert!(!ends_by(&stat("S", usual, 4)));
-        assert!(ends_by(&stat("R", exiting, 4)) && ends_by(&stat("R", exiting, 1)));
-        assert!(ends_by(&stat("Z", exiting, 2)));
-        assert!(!ends_by(&stat("Z", exiting, 1)) && !ends_by(""));
+        assert!(!is_ending_by_stat(&stat("S", usual, 4)));
+        assert!(
+            is_ending_by_stat(&stat("R", exiting, 4)) && is_ending_by_stat(&stat("R", exiting, 1))
+        );
+        assert!(is_ending_by_stat(&stat("Z", exiting, 2)));
+        assert!(!is_ending_by_stat(&stat("Z", exiting, 1)) && !is_ending_by_stat(""));
         assert!(!is_ending(std::process::id()) && !is_ending(u32::MAX));
         let mut child = std::process::Command::new("true").spawn().unwrap();
         while Liveness::of(child.id()) != Liveness::Gone {

@@ -9,7 +9,7 @@ use zerocopy::{FromBytes, IntoBytes};
 
 use crate::service::bytes;
 use crate::slam::geometry::sim3::Matrix7;
-use crate::slam::loops::known::{KnownLoops, Link};
+use crate::slam::loops::record::{Link, LoopRecord};
 use crate::slam::pose::NO_KEYFRAME;
 use crate::wire::conversion::{similarity_from_message, similarity_message};
 
@@ -32,7 +32,7 @@ pub enum LoopBytesError {
 }
 
 /// The bytes of `loops`.
-pub fn loop_bytes(loops: &KnownLoops) -> Vec<u8> {
+pub fn loop_bytes(loops: &LoopRecord) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(64 + LINK_BYTES * loops.links.len());
     bytes.extend((loops.links.len() as u64).to_le_bytes());
     for link in &loops.links {
@@ -53,9 +53,9 @@ pub fn loop_bytes(loops: &KnownLoops) -> Vec<u8> {
 }
 
 /// Parses [`loop_bytes`] and checks every number.
-pub fn parse_loops(mut bytes: &[u8]) -> Result<KnownLoops, LoopBytesError> {
+pub fn parse_loops(mut bytes: &[u8]) -> Result<LoopRecord, LoopBytesError> {
     let bytes = &mut bytes;
-    let mut loops = KnownLoops::default();
+    let mut loops = LoopRecord::default();
     for index in 0..count(bytes, LINK_BYTES)? {
         let [i, j]: [u64; 2] = take(bytes)?;
         let similarity = take(bytes)?;
@@ -107,12 +107,12 @@ pub(super) mod tests {
     use crate::slam::geometry::sim3::Sim3;
 
     /// Two loops, and all other parts.
-    pub(in crate::service) fn loops() -> KnownLoops {
+    pub(in crate::service) fn loops() -> LoopRecord {
         let rigid = SE3::exp(&[0.3, -0.2, 0.1, 0.4, 0.5, -0.6].into());
         let mut covariance = Matrix7::identity() * 1e-4;
         (covariance[(1, 4)], covariance[(4, 1)]) = (2e-5, 2e-5);
         let link = Link { i: 7, j: 3, j_from_i: Sim3::new(rigid, 1.3), covariance };
-        KnownLoops {
+        LoopRecord {
             links: vec![link, Link { i: 8, ..link }],
             held_by: [(7, vec![5, 6]), (8, vec![]), (9, vec![7])].into(),
             beginnings: [4].into(),
@@ -122,7 +122,7 @@ pub(super) mod tests {
 
     #[test]
     fn loops_survive_their_bytes() {
-        for loops in [loops(), KnownLoops::default()] {
+        for loops in [loops(), LoopRecord::default()] {
             assert_eq!(parse_loops(&loop_bytes(&loops)), Ok(loops));
         }
     }

@@ -80,7 +80,7 @@ impl ManagerNotice {
     }
 
     /// Reports that the preparation continues: until the process is ready the manager waits longer.
-    pub fn prepares(&self) {
+    pub fn extend_start(&self) {
         if !self.said_ready {
             self.send(format_args!("EXTEND_TIMEOUT_USEC={START_EXTENSION_US}"));
         }
@@ -173,11 +173,11 @@ mod tests {
         let socket = connect(path.to_str().unwrap()).ok();
         let heartbeat = Heartbeat::of(Some("1000"), None, 1);
         let mut notice = ManagerNotice { socket, heartbeat, said_ready: false };
-        notice.prepares();
+        notice.extend_start();
         assert_eq!(heard(&manager), "EXTEND_TIMEOUT_USEC=30000000");
         notice.ready();
         notice.ready();
-        notice.prepares();
+        notice.extend_start();
         notice.status(format_args!("a\nWATCHDOG=trigger{}", "\r"));
         assert_eq!(heard(&manager), "READY=1");
         assert_eq!(heard(&manager), "STATUS=a WATCHDOG=trigger ");

@@ -21,12 +21,12 @@ use crate::service::atomic_file::write_atomically;
 use crate::service::loop_bytes::{LoopBytesError, MAX_LOOP_BYTES, loop_bytes, parse_loops};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, MAX_KEYFRAME_POINTS};
-use crate::slam::loops::known::KnownLoops;
-use crate::slam::map::{ConfirmedPoint, FramePlace, Map};
+use crate::slam::loops::record::LoopRecord;
+use crate::slam::map::{ConfirmedPoint, FramePose, Map};
 use crate::slam::pose::NO_KEYFRAME;
 use crate::wire::conversion::{
     MessageError, check_points, code_from_map_state, map_state_from_code,
-    mode_covariance_from_message, place_covariance_from_message, rigid_from_message, rigid_message,
+    mode_covariance_from_message, pose_covariance_from_message, rigid_from_message, rigid_message,
     similarity_from_message, similarity_message,
 };
 
@@ -267,7 +267,7 @@ impl<R: Read> Reader<R> {
             return Err(wrong(MessageError::InvalidIntrinsics { width, height }));
         }
         let mode_covariance = mode_covariance_from_message(&self.take()?).map_err(wrong)?;
-        let place_covariance = place_covariance_from_message(&self.take()?).map_err(wrong)?;
+        let place_covariance = pose_covariance_from_message(&self.take()?).map_err(wrong)?;
         let num_points = self.count("points", MAX_KEYFRAME_POINTS as u64)?;
         let points = (0..num_points).map(|_| self.take()).collect::<Result<Vec<_>, _>>()?;
         check_points(&points, &intrinsics).map_err(wrong)?;
@@ -299,11 +299,11 @@ impl<R: Read> Reader<R> {
         })
     }
 
-    fn frame(&mut self) -> Result<FramePlace, MapFault> {
+    fn frame(&mut self) -> Result<FramePose, MapFault> {
         let [sequence, keyframe_id] = self.take()?;
         let keyframe_from_camera = rigid_from_message(&self.take()?, "keyframe_from_camera")
             .map_err(|source| MapFault::Frame { sequence, source })?;
-        Ok(FramePlace { sequence, keyframe_id, keyframe_from_camera })
+        Ok(FramePose { sequence, keyframe_id, keyframe_from_camera })
     }
 
     fn confirmed(&mut self) -> Result<ConfirmedPoint, MapFault> {
@@ -317,7 +317,7 @@ impl<R: Read> Reader<R> {
         })
     }
 
-    fn loops(&mut self) -> Result<KnownLoops, MapFault> {
+    fn loops(&mut self) -> Result<LoopRecord, MapFault> {
         let count = self.count("loop bytes", MAX_LOOP_BYTES)?;
         let mut bytes = Vec::new();
         // An invalid number reads no more than there is; the parser notices what is missing.

@@ -29,7 +29,7 @@ pub mod writer;
 use std::path::Path;
 
 use crate::service::map_folder::depth_file::MapDetail;
-use crate::service::map_folder::keeper::{head_of, is_kept};
+use crate::service::map_folder::keeper::{is_kept, map_head};
 use crate::service::map_folder::map_folder_error::MapFolderError;
 use crate::service::map_folder::writer::{MapHead, MapWriter};
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -45,7 +45,7 @@ pub fn save_copy(
 ) -> Result<(), MapFolderError> {
     let camera = mapper.keyframe().or(mapper.map().keyframes.last()).map(|of| of.intrinsics);
     let camera = camera.ok_or(MapFolderError::Empty)?;
-    write_new(folder, &camera, detail, mapper.map(), head_of(mapper), each)
+    write_new(folder, &camera, detail, mapper.map(), map_head(mapper), each)
 }
 
 /// Writes a map into a folder that holds none.

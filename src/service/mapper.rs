@@ -1,8 +1,8 @@
 //! The mapper process: pairs frames with their poses, adds them to the map, publishes it.
 
 mod commands;
-mod going_over;
 mod output;
+mod switched_map;
 
 use std::rc::Rc;
 use std::time::Duration;
@@ -15,15 +15,15 @@ use crate::service::config::Config;
 use crate::service::frame_order::{FrameOrder, FrameOrderOutcome, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::map_folder::session::{MapSession, MapSessionError};
-use crate::service::mapper::going_over::GoneOver;
 use crate::service::mapper::output::Output;
+use crate::service::mapper::switched_map::SwitchedMap;
 use crate::service::mode::Mode;
 use crate::service::pairing::Pairing;
 use crate::service::run_error::RunError;
 use crate::service::schedule::{Background, apply};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::loops::{SearchFate, SearchReport};
+use crate::slam::loops::{SearchOutcome, SearchReport};
 use crate::slam::map::Map;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
@@ -45,16 +45,16 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), RunEr
     let refusals = apply(&config.mapper.scheduling);
     refusals.iter().for_each(|refusal| tracing::warn!("mapper: {refusal}"));
     let mut shell = Shell::prepare(config, mode)?;
-    shell.health.tell_scheduling(&refusals);
+    shell.health.report_scheduling(&refusals);
     shell.load_map()?;
     shell.health.enter(ProcessState::Ready, "");
-    shell.health.tell_ready();
+    shell.health.notify_ready();
     let outcome = shell.map_until(shutdown);
     let outcome = outcome.and_then(|()| shell.save_map_folder());
     // A supervisor that did not request the end starts another mapper, which continues from the checkpoint.
     if outcome.is_ok() && !is_supervised() {
-        shell.kept.iter_mut().for_each(|kept| kept.end_in_order());
-        GoneOver::forget(&shell.place.loaded_map_path());
+        shell.kept.iter_mut().for_each(|kept| kept.remove_on_drop());
+        SwitchedMap::forget(&shell.place.loaded_map_path());
     }
     shell.health.end(&outcome, "stopped");
     outcome
@@ -140,9 +140,9 @@ impl<'a> Shell<'a> {
     fn load_map(&mut self) -> Result<(), RunError> {
         let (configured, max_bytes) = (&self.config.map, self.config.mapping.max_map_bytes());
         let path = self.place.loaded_map_path();
-        let gone_over = self.kept.as_ref().and_then(|_| GoneOver::read(&path, configured));
-        let map = gone_over.as_ref().map_or(configured, |over| &over.to);
-        let numbering = gone_over.as_ref().map_or_else(Default::default, |over| over.numbering);
+        let switched = self.kept.as_ref().and_then(|_| SwitchedMap::read(&path, configured));
+        let map = switched.as_ref().map_or(configured, |over| &over.to);
+        let numbering = switched.as_ref().map_or_else(Default::default, |over| over.numbering);
         let waits = self.mode == Mode::Lockstep;
         if !map.folder.is_empty() {
             let cause = format!("loading the map {}", map.folder);
@@ -177,7 +177,7 @@ impl<'a> Shell<'a> {
                 }
             }
             self.answer_commands()?;
-            self.look_for_silence();
+            self.check_for_silence();
             self.health.report();
         }
         Ok(())
@@ -186,7 +186,7 @@ impl<'a> Shell<'a> {
     /// The oldest frame with its pose, among those still held.
     fn next_pair(&mut self) -> Result<Option<(Frame, PoseEstimate)>, RunError> {
         while let Some(frame) = self.frames.receive()? {
-            self.take_in(frame);
+            self.hold_frame(frame);
         }
         while let Some(message) = self.poses.receive()? {
             match message.payload().first().map(pose_from_message) {
@@ -202,7 +202,7 @@ impl<'a> Shell<'a> {
     }
 
     /// Holds a valid frame that arrives in order until its pose arrives; counts invalid and missing frames.
-    fn take_in(&mut self, frame: Frame) {
+    fn hold_frame(&mut self, frame: Frame) {
         let header = *frame.header();
         if let Err(error) = frame_from_message(&header, frame.payload()) {
             self.health.counters().refused += 1;
@@ -225,7 +225,7 @@ impl<'a> Shell<'a> {
     }
 
     /// Live: reports when frames have stopped. The next step ends the state.
-    fn look_for_silence(&mut self) {
+    fn check_for_silence(&mut self) {
         let periods = self.config.tracker.stale_periods;
         if self.mode == Mode::Live && self.order.is_silent(self.last_arrival_nanos, periods) {
             self.health.enter(ProcessState::Stale, SILENCE);
@@ -239,7 +239,7 @@ impl<'a> Shell<'a> {
         else {
             return Ok(());
         };
-        if !self.suits_camera(intrinsics)? {
+        if !self.ensure_mapper(intrinsics)? {
             return Ok(());
         }
         let Some((_, mapper)) = &mut self.mapper else { return Ok(()) };
@@ -265,19 +265,19 @@ impl<'a> Shell<'a> {
         self.output.publish(mapper, &finished)?;
         let adjusted = self.adjustments.after_frame(mapper, frame.sequence);
         self.output.publish(mapper, &adjusted)?;
-        tell_adjustments(&mut self.adjustments, &self.output, &mut self.health)?;
+        publish_adjustments(&mut self.adjustments, &self.output, &mut self.health)?;
         let durations = [step_nanos, change_nanos];
         self.output.publish_step(mapper, frame.sequence, durations, self.last_pose.as_ref())?;
         self.follow(&[&outcome, &adjusted]);
         if let Some(failure) = self.map.as_mut().and_then(MapSession::take_failure) {
             self.health.warn(&failure);
         }
-        self.tell_step(step_nanos);
+        self.report_step(step_nanos);
         Ok(())
     }
 
     /// Whether there is a mapper for frames of this camera; makes one where the camera has changed.
-    fn suits_camera(&mut self, intrinsics: Intrinsics) -> Result<bool, RunError> {
+    fn ensure_mapper(&mut self, intrinsics: Intrinsics) -> Result<bool, RunError> {
         if self.mapper.as_ref().is_some_and(|(of, _)| *of == intrinsics) {
             return Ok(true);
         }
@@ -304,12 +304,12 @@ impl<'a> Shell<'a> {
     }
 
     /// Reports the contents of the map after a step, and the duration of the step.
-    fn tell_step(&mut self, step_nanos: u64) {
+    fn report_step(&mut self, step_nanos: u64) {
         let Some((_, mapper)) = &self.mapper else { return };
         let counters = self.health.counters();
         counters.frames += 1;
         counters.dropped = self.missing.saturating_add(self.pairing.dropped());
-        counters.total = mapper.map().num_held() as u64;
+        counters.total = mapper.map().num_with_depth() as u64;
         counters.detail = mapper.keyframe().map_or(0, |k| code_from_map_state(k.map_state));
         self.health.count_work(step_nanos);
         self.health.count_latency(step_nanos);
@@ -321,10 +321,10 @@ impl<'a> Shell<'a> {
     /// Live: lets a finished joint estimate into the map and publishes it, although no frame arrives.
     fn pick_up_adjustment(&mut self) -> Result<(), RunError> {
         let Some((_, mapper)) = &mut self.mapper else { return Ok(()) };
-        let outcome = self.adjustments.pick_up(mapper);
+        let outcome = self.adjustments.apply_ready(mapper);
         self.output.publish(mapper, &outcome)?;
         self.follow(&[&outcome]);
-        tell_adjustments(&mut self.adjustments, &self.output, &mut self.health)?;
+        publish_adjustments(&mut self.adjustments, &self.output, &mut self.health)?;
         Ok(())
     }
 
@@ -336,8 +336,8 @@ impl<'a> Shell<'a> {
         self.output.open_images(&self.hub, &intrinsics)?;
         if let Some((_, before)) = self.mapper.take() {
             self.health.counters().resized += 1;
-            mapper.succeed(before);
-            self.adjustments.orphan();
+            mapper.continue_from(before);
+            self.adjustments.abandon();
             if self.map.take().is_some() {
                 self.health.warn("the camera has changed: frames of the new one are not added to the map on disk");
             }
@@ -358,7 +358,7 @@ impl<'a> Shell<'a> {
 }
 
 /// Publishes and counts finished joint estimates; reports when there will be no more.
-fn tell_adjustments(
+fn publish_adjustments(
     adjustments: &mut Adjustments,
     output: &Output,
     health: &mut Health,
@@ -368,21 +368,21 @@ fn tell_adjustments(
         output.publish_adjustment(&record)?;
     }
     for search in adjustments.take_searches() {
-        health.count_search(&search.report.fate);
-        tell_search(&search.report);
+        health.count_search(&search.report.outcome);
+        log_search(&search.report);
     }
     adjustments.take_failure().iter().for_each(|failure| health.warn(failure));
     Ok(())
 }
 
 /// Logs closed loops and joined epochs.
-fn tell_search(report: &SearchReport) {
+fn log_search(report: &SearchReport) {
     let (keyframe, other) = (report.keyframe_id, report.other.unwrap_or(NO_KEYFRAME));
-    match report.fate {
-        SearchFate::Closed => {
+    match report.outcome {
+        SearchOutcome::Closed => {
             tracing::info!("loop closed: keyframe {keyframe} matches {other}; map corrected")
         }
-        SearchFate::Joined => {
+        SearchOutcome::Joined => {
             tracing::info!("epochs joined: keyframe {keyframe} matches {other}")
         }
         _ => {}

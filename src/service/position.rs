@@ -62,11 +62,11 @@ impl Position {
 
 /// Keeps the position of this process where it can: capture works without a file too.
 #[derive(Debug, Default)]
-pub struct PositionKeeper {
+pub struct PositionRecorder {
     file: Option<PositionFile>,
 }
 
-impl PositionKeeper {
+impl PositionRecorder {
     /// Keeps the position in `source` in the file at `path`, and returns where a capture of the same run died. Nothing
     /// is kept in lockstep: such a run ends with any of its processes.
     pub fn of_run(
@@ -91,7 +91,7 @@ impl PositionKeeper {
     }
 
     /// Writes the position of a frame that is about to be sent. A failure is logged once.
-    pub fn note_or_warn(&mut self, position: &Position) {
+    pub fn write_or_warn(&mut self, position: &Position) {
         if let Some(Err(error)) = self.file.as_mut().map(|file| file.note(position)) {
             tracing::warn!("the position in the source is no longer saved ({error})");
             self.file = None;
@@ -99,8 +99,8 @@ impl PositionKeeper {
     }
 
     /// No capture continues from here: the file is removed on drop.
-    pub fn end_in_order(&mut self) {
-        self.file.iter_mut().for_each(PositionFile::end_in_order);
+    pub fn remove_on_drop(&mut self) {
+        self.file.iter_mut().for_each(PositionFile::remove_on_drop);
     }
 }
 
@@ -164,7 +164,7 @@ impl PositionFile {
         self.file.write_all_at(&slot, (self.writes % SLOTS) * SLOT_BYTES as u64)
     }
 
-    fn end_in_order(&mut self) {
+    fn remove_on_drop(&mut self) {
         self.is_over = true;
     }
 }
@@ -230,13 +230,13 @@ mod tests {
             keeper.note(&position(sequence)).unwrap();
             assert_eq!(read_position(&path, key), Some(position(sequence)));
         }
-        // A kill runs no destructor; a drop without `end_in_order` is equivalent.
+        // A kill runs no destructor; a drop without `remove_on_drop` is equivalent.
         drop(keeper);
         let (mut next, left) = PositionFile::open(&path, key).unwrap();
         assert_eq!(left, Some(position(4)));
         next.note(&position(5)).unwrap();
         assert_eq!(read_position(&path, key), Some(position(5)));
-        next.end_in_order();
+        next.remove_on_drop();
         drop(next);
         assert!(!path.exists());
         let (mut keeper, _) = PositionFile::open(&path, key).unwrap();

@@ -19,12 +19,12 @@ const LONGEST_FINISH: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub struct ProgressThread {
     thread: JoinHandle<()>,
-    handed: Arc<Handed>,
+    handed: Arc<PendingProgress>,
 }
 
 /// The newest progress replaces one that was not shown yet.
 #[derive(Debug)]
-struct Handed {
+struct PendingProgress {
     newest: ArrayQueue<RunProgress>,
     is_over: AtomicBool,
 }
@@ -33,7 +33,7 @@ impl ProgressThread {
     /// Starts it with a function that shows progress; `None` is the end.
     pub fn start(mut show: impl FnMut(Option<&RunProgress>) + Send + 'static) -> io::Result<Self> {
         let newest = ArrayQueue::new(1);
-        let handed = Arc::new(Handed { newest, is_over: AtomicBool::new(false) });
+        let handed = Arc::new(PendingProgress { newest, is_over: AtomicBool::new(false) });
         let taken = Arc::clone(&handed);
         let thread = std::thread::Builder::new().name("semidense-display".to_owned());
         let thread = thread.spawn(move || {

@@ -11,7 +11,7 @@ use crate::slam::image::buffer::Image;
 
 /// Frames that are read before they are requested. One is enough while decoding is faster than mapping; the others
 /// bridge frames that take long.
-const MOST_AHEAD: usize = 3;
+const MAX_AHEAD: usize = 3;
 
 /// What to read, and until when.
 #[derive(Debug, Clone, Copy)]
@@ -52,10 +52,10 @@ impl ReadAhead {
         plan: ReadingPlan,
     ) -> std::io::Result<Self> {
         let camera = source.intrinsics();
-        let (to_taker, frames) = bounded(MOST_AHEAD);
+        let (to_taker, frames) = bounded(MAX_AHEAD);
         // One more is held by the consumer.
-        let (spare, memory) = bounded(MOST_AHEAD + 1);
-        for _ in 0..MOST_AHEAD + 1 {
+        let (spare, memory) = bounded(MAX_AHEAD + 1);
+        for _ in 0..MAX_AHEAD + 1 {
             // Cannot fail: the receiver is held here.
             let _ = spare.send(vec![0; camera.width * camera.height]);
         }
@@ -94,7 +94,7 @@ fn read(
             Ok(Some(stamp)) if plan.with_depth => (false, source.depth_at(stamp.capture_nanos)),
             Ok(Some(_)) => (false, Ok(None)),
             Ok(None) => (true, Ok(None)),
-            Err(error) => (plan.is_strict || !error.is_passing(), Ok(None)),
+            Err(error) => (plan.is_strict || !error.is_transient(), Ok(None)),
         };
         if let Ok(Some(_)) = stamp {
             num_read += 1;

@@ -52,7 +52,7 @@ impl Recorder {
         let before = self.recording.num_poses() + self.recording.num_steps();
         while let Some(message) = self.poses.receive()? {
             let Some(pose) = message.payload().first() else { continue };
-            match self.recording.take_pose(pose) {
+            match self.recording.add_pose(pose) {
                 Err(error) => tracing::warn!("tracker/pose: {error}"),
                 Ok(()) => self.keep(|| Record::Pose(Box::new(*pose))),
             }
@@ -60,7 +60,7 @@ impl Recorder {
         while let Some(message) = self.steps.receive()? {
             let Some(step) = message.payload().first() else { continue };
             let StepMessage { step_nanos, change_nanos, start_frame, .. } = *step;
-            self.recording.take_step(step_nanos, change_nanos, start_frame);
+            self.recording.add_step(step_nanos, change_nanos, start_frame);
             self.keep(|| Record::Step(Step { step_nanos, change_nanos, start_frame }));
             self.last_step = Some(*step);
         }
@@ -69,7 +69,7 @@ impl Recorder {
             match adjustment_from_message(adjustment) {
                 Err(error) => tracing::warn!("mapper/adjustment: {error}"),
                 Ok(record) => {
-                    self.recording.take_adjustment(record);
+                    self.recording.add_adjustment(record);
                     self.keep(|| Record::Adjustment(*adjustment));
                 }
             }
@@ -122,10 +122,11 @@ impl Recorder {
     }
 
     /// Takes back the poses that only the journal has; returns how many cannot be read and are lost.
-    pub fn take_back(&mut self) -> usize {
+    pub fn read_back_poses(&mut self) -> usize {
         let num_released = self.recording.num_released();
         let Some(journal) = self.journal.as_ref().filter(|_| num_released > 0) else { return 0 };
-        let missing = self.recording.take_back(|take| journal.read_poses(num_released, take));
+        let missing =
+            self.recording.restore_released(|take| journal.read_poses(num_released, take));
         if missing > 0 {
             let folder = journal.folder().display();
             tracing::warn!("{folder}: {missing} of {num_released} poses cannot be read back");
@@ -133,7 +134,7 @@ impl Recorder {
         missing
     }
 
-    /// The record of the whole run, after [`Recorder::take_back`], and its complete journal.
+    /// The record of the whole run, after [`Recorder::read_back_poses`], and its complete journal.
     pub fn into_record(mut self, parts: RecordParts) -> (RunRecord, Option<Journal>) {
         self.count(parts.counters);
         self.collect_keyframes(true);

@@ -86,7 +86,7 @@ pub struct RecordParts {
 
 impl Recording {
     /// Takes in a pose as it was sent.
-    pub fn take_pose(&mut self, message: &PoseMessage) -> Result<(), MessageError> {
+    pub fn add_pose(&mut self, message: &PoseMessage) -> Result<(), MessageError> {
         let pose = recorded(message)?;
         let latency = i64::try_from(message.latency_nanos).unwrap_or(i64::MAX);
         let sent_nanos = message.published_nanos.saturating_sub(latency);
@@ -116,7 +116,7 @@ impl Recording {
     }
 
     /// Takes back the released poses, which `read` gives in order; returns how many are lost.
-    pub fn take_back(&mut self, read: impl FnOnce(&mut dyn FnMut(&PoseMessage))) -> usize {
+    pub fn restore_released(&mut self, read: impl FnOnce(&mut dyn FnMut(&PoseMessage))) -> usize {
         let mut poses = Vec::with_capacity(self.num_poses());
         // They were valid when they arrived.
         read(&mut |message| poses.extend(recorded(message)));
@@ -128,7 +128,7 @@ impl Recording {
 
     /// Takes in a step of the mapper: its duration, `change_nanos` (0 where no keyframe was made), and the code of the
     /// frame's outcome in a start.
-    pub fn take_step(&mut self, step_nanos: u64, change_nanos: u64, start_frame: u32) {
+    pub fn add_step(&mut self, step_nanos: u64, change_nanos: u64, start_frame: u32) {
         self.start.count(start_frame_from_code(start_frame));
         self.map_nanos.push(step_nanos);
         if change_nanos > 0 {
@@ -138,7 +138,7 @@ impl Recording {
     }
 
     /// Takes in a finished joint estimate of keyframes.
-    pub fn take_adjustment(&mut self, adjustment: AdjustmentRecord) {
+    pub fn add_adjustment(&mut self, adjustment: AdjustmentRecord) {
         self.adjustments.push(adjustment);
     }
 
@@ -246,8 +246,8 @@ mod tests {
         let messages: Vec<PoseMessage> = (0..900).map(message).collect();
         let (mut whole, mut released) = (Recording::default(), Recording::default());
         for (number, message) in messages.iter().enumerate() {
-            whole.take_pose(message).unwrap();
-            released.take_pose(message).unwrap();
+            whole.add_pose(message).unwrap();
+            released.add_pose(message).unwrap();
             if number % 7 == 0 {
                 // Only existing poses are released.
                 released.release(if number > 800 { 2000 } else { number / 2 });
@@ -257,11 +257,12 @@ mod tests {
         }
         let num_released = released.num_released();
         assert!(num_released > 800 && released.poses.capacity() < 600, "{num_released}");
-        let missing = released.take_back(|take| messages[..num_released].iter().for_each(take));
+        let missing =
+            released.restore_released(|take| messages[..num_released].iter().for_each(take));
         assert_eq!((missing, released.num_released()), (0, 0));
         assert_eq!(format!("{released:?}"), format!("{whole:?}"));
         released.release(10);
-        let missing = released.take_back(|take| messages[..8].iter().for_each(take));
+        let missing = released.restore_released(|take| messages[..8].iter().for_each(take));
         assert_eq!((missing, released.num_poses()), (2, 898));
     }
 }

@@ -178,12 +178,13 @@ fn open_until_stopped(place: &Place, shared: &Shared) -> Option<Opened> {
         hub.reserve()?;
         Ok((ports.0, ports.1, hub))
     };
-    let mut said = SaidOnce::default();
+    let mut said = LogOnChange::default();
     while !shared.stop.load(Ordering::Acquire) {
         match open() {
             Ok(opened) => return Some(opened),
             Err(error) => {
-                said.news(&error).inspect(|news| tracing::error!("no keyframes yet: {news}"));
+                said.changed_text(&error)
+                    .inspect(|news| tracing::error!("no keyframes yet: {news}"));
             }
         }
         // A pause; if waiting fails, the next attempt is only sooner.
@@ -196,7 +197,7 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
     let Some((mut inbox, steps, _hub)) = open_until_stopped(place, shared) else { return };
     // Until the first keyframe. Here and not in the frame loop, as it maps memory of the mapper.
     let mut steps: Option<Subscriber<StepMessage, ()>> = Some(steps);
-    let mut said = SaidOnce::default();
+    let mut said = LogOnChange::default();
     let mut scratch = ReferenceScratch::default();
     while !shared.stop.load(Ordering::Acquire) {
         if let Err(error) = wait(&[inbox.events()], None, WAKE_PERIOD) {
@@ -206,7 +207,7 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
         match inbox.newest() {
             Ok(None) => {}
             Ok(Some(keyframe)) => {
-                said = SaidOnce::default();
+                said = LogOnChange::default();
                 // A reference that the tracker has not taken yet is older: its memory is reused.
                 let reference = prepare(&keyframe, shared.used.pop(), params, &mut scratch);
                 if let Some(last) = steps.take().and_then(|steps| last_pose(&steps)) {
@@ -217,7 +218,7 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
                 }
             }
             Err(error) => {
-                said.news(&error).inspect(|news| tracing::warn!("{news}"));
+                said.changed_text(&error).inspect(|news| tracing::warn!("{news}"));
             }
         }
     }
@@ -225,11 +226,11 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
 
 /// Keeps a recurring error from filling the log.
 #[derive(Debug, Default)]
-struct SaidOnce(String);
+struct LogOnChange(String);
 
-impl SaidOnce {
+impl LogOnChange {
     /// The text of an error that differs from the last.
-    fn news(&mut self, error: &dyn std::error::Error) -> Option<String> {
+    fn changed_text(&mut self, error: &dyn std::error::Error) -> Option<String> {
         let text = error.to_string();
         (text != self.0).then(|| self.0.clone_from(&text))?;
         Some(text)
@@ -249,9 +250,11 @@ mod tests {
     #[test]
     fn an_error_is_reported_once_per_change() {
         let error = |text: &str| io::Error::other(text.to_owned());
-        let mut said = SaidOnce::default();
-        let news: Vec<_> =
-            ["a", "a", "b", "b", "a"].iter().filter_map(|text| said.news(&error(text))).collect();
+        let mut said = LogOnChange::default();
+        let news: Vec<_> = ["a", "a", "b", "b", "a"]
+            .iter()
+            .filter_map(|text| said.changed_text(&error(text)))
+            .collect();
         assert_eq!(news, ["a", "b", "a"]);
     }
 }

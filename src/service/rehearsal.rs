@@ -9,10 +9,10 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::tracker::{Memory, Tracker};
 
 /// Fewest frames from one realigned frame to the next: a twentieth of a replay's time.
-const LEAST_INTERVAL: usize = 10;
+const MIN_INTERVAL: usize = 10;
 
 /// Most realigned frames of a sequence: enough for a percentile.
-const MOST_FRAMES: usize = 60;
+const MAX_FRAMES: usize = 60;
 
 /// One point in this many is enough for a mean.
 const POINT_STRIDE: usize = 8;
@@ -29,7 +29,7 @@ pub struct Rehearsal {
 impl Rehearsal {
     /// For a sequence of `total` frames, if that is known.
     pub fn new(total: Option<usize>) -> Self {
-        let interval = total.map_or(0, |total| total.div_ceil(MOST_FRAMES)).max(LEAST_INTERVAL);
+        let interval = total.map_or(0, |total| total.div_ceil(MAX_FRAMES)).max(MIN_INTERVAL);
         Self { interval, frames: 0, samples: Vec::new(), nanos: 0 }
     }
 
@@ -37,7 +37,7 @@ impl Rehearsal {
     /// unchanged.
     pub fn observe(&mut self, tracker: &mut Tracker, memory: &Memory, frame: &FrameView<'_>) {
         self.frames += 1;
-        if !self.frames.is_multiple_of(self.interval) || self.samples.len() >= MOST_FRAMES {
+        if !self.frames.is_multiple_of(self.interval) || self.samples.len() >= MAX_FRAMES {
             return;
         }
         let begin = Instant::now();

@@ -172,7 +172,7 @@ pub fn replay(
     observe: &mut dyn FnMut(&ReplayProgress<'_>) -> bool,
 ) -> Result<RunRecord, ReplayError> {
     let mut replay = Replay::new(source, source_name, config)?;
-    let total = frames_to_come(source, config);
+    let total = total_frames(source, config);
     let plan = ReadingPlan {
         max_frames: config.max_frames.unwrap_or(usize::MAX),
         with_depth: config.initial_depth == DepthOrigin::Sensor,
@@ -198,7 +198,7 @@ pub fn replay(
 }
 
 /// Frames in all, if that is known.
-fn frames_to_come(source: &dyn FrameSource, config: &ReplayConfig) -> Option<usize> {
+fn total_frames(source: &dyn FrameSource, config: &ReplayConfig) -> Option<usize> {
     source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)))
 }
 
@@ -261,7 +261,7 @@ impl<'a> Replay<'a> {
             mapper,
             map,
             given_poses: Vec::new(),
-            rehearsal: Rehearsal::new(frames_to_come(source, config)),
+            rehearsal: Rehearsal::new(total_frames(source, config)),
             spare: None,
             record: RunRecord {
                 is_depth_from_sensor: config.initial_depth == DepthOrigin::Sensor,
@@ -291,9 +291,9 @@ impl<'a> Replay<'a> {
             let stamp = match read.stamp {
                 Ok(Some(stamp)) => stamp,
                 Ok(None) => break,
-                Err(error) if error.is_passing() && !self.config.strict => {
+                Err(error) if error.is_transient() && !self.config.strict => {
                     refused.refuse(&error);
-                    self.leave_out();
+                    self.skip_frame();
                     frames.give_back(read.pixels);
                     continue;
                 }
@@ -359,7 +359,7 @@ impl<'a> Replay<'a> {
             self.record.keyframe_nanos.push(change_nanos);
         }
         if outcome.needs_publishing() && self.config.poses == PoseOrigin::Tracker {
-            self.hand_on_keyframe();
+            self.pass_keyframe_to_tracker();
         }
         Ok((pose.state, outcome))
     }
@@ -379,7 +379,7 @@ impl<'a> Replay<'a> {
             return Ok(None);
         }
         let sensor_depth = match read {
-            Err(error) if error.is_passing() && !self.config.strict => {
+            Err(error) if error.is_transient() && !self.config.strict => {
                 tracing::warn!("left out: {error}");
                 None
             }
@@ -392,7 +392,7 @@ impl<'a> Replay<'a> {
     }
 
     /// Gives the tracker the mapper's keyframe, in the memory of the previous one.
-    fn hand_on_keyframe(&mut self) {
+    fn pass_keyframe_to_tracker(&mut self) {
         let Some(keyframe) = self.mapper.keyframe() else { return };
         let new = || Box::new(Reference::new(self.config.tracker.reference.clone()));
         let mut reference = self.spare.take().unwrap_or_else(new);
@@ -455,7 +455,7 @@ impl<'a> Replay<'a> {
     }
 
     /// Leaves an image out: its place in the sequence stays empty, which is not a gap.
-    fn leave_out(&mut self) {
+    fn skip_frame(&mut self) {
         if let Some((_, last)) = &mut self.stamps {
             last.sequence = last.sequence.saturating_add(1);
         }
@@ -463,7 +463,7 @@ impl<'a> Replay<'a> {
 
     /// The record, and whether the map was saved.
     fn finish(mut self, begin: Instant) -> Result<(RunRecord, Saved), ReplayError> {
-        self.mapper.give_back_frames();
+        self.mapper.free_frames();
         self.adjustments.finish(&mut self.mapper);
         let saved = self.map.map_or(Ok(()), |mut map| map.save_all(&self.mapper, &mut || ()));
         let mut record = self.record;

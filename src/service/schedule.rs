@@ -122,7 +122,7 @@ pub enum Refusal {
 
 /// The scheduling in effect, as the kernel reports it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct InForce {
+pub struct ActiveScheduling {
     /// Policy of the calling thread; `None` for an unknown one.
     pub policy: Option<Policy>,
     /// Priority of FIFO, else 0.
@@ -237,7 +237,7 @@ fn set_attributes(attributes: SchedAttr) -> std::io::Result<()> {
 }
 
 /// The scheduling of the calling thread, as the kernel reports it.
-pub fn in_force() -> InForce {
+pub fn active_scheduling() -> ActiveScheduling {
     let mut attributes = SchedAttr::default();
     let size = size_of::<SchedAttr>() as libc::c_uint;
     // SAFETY: the kernel writes at most `size` bytes to a struct of that size whose every bit pattern is
@@ -259,7 +259,11 @@ pub fn in_force() -> InForce {
         _ => None,
     };
     let priority = if policy == Some(Policy::Fifo) { attributes.priority } else { 0 };
-    InForce { policy, priority, memory_locked: locked_kilobytes().is_some_and(|kb| kb > 0) }
+    ActiveScheduling {
+        policy,
+        priority,
+        memory_locked: locked_kilobytes().is_some_and(|kb| kb > 0),
+    }
 }
 
 /// Locked memory of this process according to the kernel.
@@ -322,7 +326,7 @@ mod tests {
     #[test]
     fn a_request_is_in_force_or_refused_with_its_limit() {
         let asked = SchedulingParams { policy: Policy::Fifo, priority: 42, ..Default::default() };
-        let (refusals, found) = in_thread(move || (apply(&asked), in_force()));
+        let (refusals, found) = in_thread(move || (apply(&asked), active_scheduling()));
         match refusals.first() {
             None => assert_eq!((found.policy, found.priority), (Some(Policy::Fifo), 42)),
             Some(refusal) => {
@@ -337,7 +341,7 @@ mod tests {
         let asked = SchedulingParams { policy: Policy::Fifo, ..Default::default() };
         let found = in_thread(move || {
             apply(&asked);
-            in_thread(in_force)
+            in_thread(active_scheduling)
         });
         assert_eq!(found.policy, Some(Policy::Other));
     }
@@ -354,8 +358,9 @@ mod tests {
 
     #[test]
     fn nothing_changes_unless_requested() {
-        let (before, refusals, after) =
-            in_thread(|| (in_force(), apply(&SchedulingParams::default()), in_force()));
+        let (before, refusals, after) = in_thread(|| {
+            (active_scheduling(), apply(&SchedulingParams::default()), active_scheduling())
+        });
         assert_eq!((refusals, before), (Vec::new(), after));
     }
 

@@ -126,7 +126,7 @@ pub fn soak(
     let outcome = run(&config, &options, shutdown, &mut |progress| {
         observe(progress);
         if matches!(progress, RunProgress::Running { .. }) {
-            watch.look();
+            watch.sample_if_due();
         }
     })?;
     // There are no results that would need it.
@@ -160,7 +160,7 @@ impl Watch {
     }
 
     /// Takes a sample when one is due; a process without a message yet is queried again at the next call.
-    fn look(&mut self) {
+    fn sample_if_due(&mut self) {
         let started = *self.started.get_or_insert_with(Instant::now);
         if self.peers.is_none() {
             self.peers = listen(&self.place);
@@ -175,7 +175,7 @@ impl Watch {
         let [tracker, mapper] = [TRACKER, MAPPER].map(|process| &heard[process]);
         let counts = [tracker.work_counts, mapper.work_counts, mapper.adjustment_counts];
         let times: Vec<[f64; 2]> =
-            counts.iter().zip(&self.before).map(|(now, before)| since(now, before)).collect();
+            counts.iter().zip(&self.before).map(|(now, before)| times_since(now, before)).collect();
         self.before = counts;
         let memory = |process: u32| resident_mb(&process.to_string());
         self.samples.push(Sample {
@@ -205,7 +205,7 @@ fn listen(place: &Place) -> Option<(Hub, [Peer; 3])> {
 }
 
 /// Median and 99th percentile of the times counted since then; NaN without any.
-fn since(now: &Counts, before: &Counts) -> [f64; 2] {
+fn times_since(now: &Counts, before: &Counts) -> [f64; 2] {
     // A restarted process counts from 0.
     let counts = std::array::from_fn(|i| now[i].saturating_sub(before[i]));
     [0.5, 0.99].map(|share| percentile_ms(&counts, share).unwrap_or(f64::NAN))
@@ -317,10 +317,10 @@ mod tests {
     fn times_cover_the_frames_since_the_previous_sample() {
         let (mut now, mut before) = ([0; HISTOGRAM_BUCKETS], [0; HISTOGRAM_BUCKETS]);
         (now[10], before[10], now[20]) = (1000, 1000, 5);
-        let [median, _] = since(&now, &before);
+        let [median, _] = times_since(&now, &before);
         assert!(median > percentile_ms(&before, 0.99).unwrap());
         before[20] = 5;
-        assert!(since(&now, &before)[0].is_nan());
+        assert!(times_since(&now, &before)[0].is_nan());
     }
 
     #[test]

@@ -30,9 +30,9 @@ const HEALTHY_LIFE: Duration = Duration::from_secs(2);
 const KILLS_AT_ONCE: u32 = 10;
 /// Shortest time that a process has for its first sign of life: it is loaded, reads its configuration and joins the
 /// others, on a machine that may be busy.
-const FIRST_SIGN: Duration = Duration::from_secs(30);
+const FIRST_SIGN_TIMEOUT: Duration = Duration::from_secs(30);
 /// A supervisor that has not checked for this long was held up itself and cannot tell which process was silent.
-const HELD_UP: Duration = Duration::from_secs(1);
+const SUPERVISOR_STALL: Duration = Duration::from_secs(1);
 /// Free shared memory below which a SIGBUS is attributed to its exhaustion, bytes: less than the smallest segment of
 /// images.
 const NEARLY_FULL_BYTES: u64 = 1 << 20;
@@ -116,7 +116,7 @@ impl Supervised {
         let last = self.peer.update()?.map(|health| (health.process_id, health.published_nanos));
         // Not the last message of its predecessor.
         let is_own = last.is_some_and(|(id, _)| id == pid);
-        let was_held_up = now.duration_since(self.last_look) > HELD_UP;
+        let was_held_up = now.duration_since(self.last_look) > SUPERVISOR_STALL;
         if was_held_up || is_own && last.map(|(_, nanos)| nanos) != before {
             self.last_sign = now;
         }
@@ -134,14 +134,14 @@ impl Supervised {
             return false;
         }
         let has_spoken = self.peer.last().is_some();
-        let allowed = if has_spoken { watchdog } else { watchdog.max(FIRST_SIGN) };
+        let allowed = if has_spoken { watchdog } else { watchdog.max(FIRST_SIGN_TIMEOUT) };
         let is_at_its_end =
             matches!(self.peer.state(), Some(ProcessState::Finished | ProcessState::Failed));
         let writes_map = self.peer.last().is_some_and(|last| cause(last) == WRITES_MAP);
         let silence = self.last_look.duration_since(self.last_sign);
         // A process at its end has sent its last message, and has as long as any other to exit. One that writes its map
         // gives a sign between two keyframes, each of which a slow disk may delay.
-        let extra = if is_at_its_end || writes_map { FIRST_SIGN } else { Duration::ZERO };
+        let extra = if is_at_its_end || writes_map { FIRST_SIGN_TIMEOUT } else { Duration::ZERO };
         silence > allowed + extra
     }
 
@@ -155,7 +155,7 @@ impl Supervised {
             let fault = child.fault();
             // Its last health; without it its counts are slightly older.
             drop(self.listen());
-            self.bury();
+            self.note_end();
             // Only capture ends without being stopped: with its source.
             let is_end = status.success() && name == CAPTURE_HEALTH.owner;
             return Ok(Some((!is_end).then(|| death(name, status, fault))));
@@ -165,13 +165,13 @@ impl Supervised {
         }
         let liveness = Liveness::of(child.id());
         child.kill();
-        self.bury();
+        self.note_end();
         let cause = hang(name, liveness);
         Ok(Some(Some(Death { cause, is_fault: false, is_bus_error: false, is_kill: false })))
     }
 
     /// Notes its end: its life counts for the pause before the next start.
-    fn bury(&mut self) {
+    fn note_end(&mut self) {
         // A process that never became ready died of its start, however long that took.
         if self.was_ready && self.child.as_ref().is_some_and(|child| child.age() > HEALTHY_LIFE) {
             (self.hasty_restarts, self.kills) = (0, 0);
@@ -181,21 +181,21 @@ impl Supervised {
 
     /// Whether it is restarted after this death: a process that reports a fault of its own would meet it again, unless
     /// it has just replaced another and found the place not yet cleared, or another was killed at that time
-    /// (`kill_is_felt`), whose half-made ports it met.
-    pub fn may_restart(&self, death: &Death, kill_is_felt: bool, max_restarts: u32) -> bool {
+    /// (`is_after_kill`), whose half-made ports it met.
+    pub fn may_restart(&self, death: &Death, is_after_kill: bool, max_restarts: u32) -> bool {
         let is_own = death.is_fault && (self.was_ready || self.restarts() == 0);
-        (kill_is_felt || !is_own)
-            && (self.is_mere_kill(death) || self.hasty_restarts < max_restarts)
+        (is_after_kill || !is_own)
+            && (self.is_external_kill(death) || self.hasty_restarts < max_restarts)
     }
 
     /// Whether this death shows nothing about the process: it was ready, and was killed from outside.
-    fn is_mere_kill(&self, death: &Death) -> bool {
+    fn is_external_kill(&self, death: &Death) -> bool {
         death.is_kill && self.was_ready && self.kills < KILLS_AT_ONCE
     }
 
     /// Plans the next start: at once for a process that had lived, with growing pauses for one that dies of its start.
     pub fn plan_restart(&mut self, death: Death) {
-        if self.is_mere_kill(&death) {
+        if self.is_external_kill(&death) {
             self.due = Some(Instant::now());
             self.kills += 1;
         } else {
@@ -305,8 +305,9 @@ mod tests {
         let mut process = Supervised::new(Peer::open(&hub, &CAPTURE_HEALTH).unwrap());
         let fault = death("capture", ExitStatus::from_raw(1 << 8), Some("no port".to_owned()));
         let kill = death("capture", ExitStatus::from_raw(9), None);
-        let may =
-            |process: &Supervised, death, kill_is_felt| process.may_restart(death, kill_is_felt, 2);
+        let may = |process: &Supervised, death, is_after_kill| {
+            process.may_restart(death, is_after_kill, 2)
+        };
         assert!(!may(&process, &fault, false), "its first start");
         assert!(may(&process, &fault, true) && may(&process, &kill, false));
         process.plan_restart(fault.clone());

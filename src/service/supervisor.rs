@@ -45,7 +45,7 @@ const SILENCE: Duration = Duration::from_millis(500);
 const RESERVE_PERIOD: Duration = Duration::from_secs(1);
 /// How long after a kill a process may still fail because of it: opening what a process killed in its start left half
 /// made is tried fifty times, half a second each.
-const KILL_IS_FELT: Duration = Duration::from_secs(30);
+const KILL_AFTERMATH: Duration = Duration::from_secs(30);
 /// Pause between two checks for the end or the answer of a process.
 const ANSWER_PAUSE: Duration = Duration::from_millis(5);
 
@@ -92,11 +92,11 @@ pub fn run(
     let place = Place::new(&config.instance, &config.root)?;
     let _claim = claim_all(&place)?;
     // State left by an earlier run does not belong to this one.
-    place.forget_run();
+    place.remove_run_files();
     place.check_shared_memory(shared_memory_bytes(&source.intrinsics(), None))?;
     let outcome = supervise(config, options, &place, source, shutdown, observe);
     // However it ended, no process continues from here.
-    place.forget_run();
+    place.remove_run_files();
     outcome
 }
 
@@ -112,7 +112,7 @@ fn supervise(
     let mut supervisor = Supervisor::start(config, options, place)?;
     let mut ended = supervisor.watch(shutdown, observe)?;
     supervisor.stop(CAPTURE, shutdown);
-    supervisor.settle(&ended, shutdown)?;
+    supervisor.drain(&ended, shutdown)?;
     // Without a pose there is no map; a mapper that is still starting would be waited for in vain.
     let has_map = options.keeps_map && supervisor.recorder.recording.num_poses() > 0;
     let mut map = match has_map.then(|| supervisor.final_map(shutdown)).transpose() {
@@ -134,7 +134,7 @@ fn supervise(
         ended = EndOfRun::Failed(cause.clone());
     }
     let (mut recorder, counters, restart_causes) = supervisor.finish(shutdown)?;
-    if let (EndOfRun::Finished, missing @ 1..) = (&ended, recorder.take_back()) {
+    if let (EndOfRun::Finished, missing @ 1..) = (&ended, recorder.read_back_poses()) {
         ended = EndOfRun::Failed(format!("{missing} poses cannot be read back from the journal"));
     }
     let num_poses = recorder.recording.num_poses();
@@ -352,10 +352,10 @@ impl<'a> Supervisor<'a> {
             self.killed = Some(Instant::now());
         }
         for (index, death) in deaths {
-            let counted = self.counted(index);
+            let counted = self.counters_of(index);
             self.of_ended.add(&counted);
             self.processes[index].peer.forget();
-            if let Some(failed) = self.mourn(index, death) {
+            if let Some(failed) = self.on_death(index, death) {
                 return Ok(Some(failed));
             }
         }
@@ -364,15 +364,15 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Plans a restart after a death, or returns the failure of the run.
-    fn mourn(&mut self, index: usize, death: Death) -> Option<EndOfRun> {
+    fn on_death(&mut self, index: usize, death: Death) -> Option<EndOfRun> {
         if death.is_bus_error {
             self.bus_error = Some(death.cause.clone());
         }
         let process = &mut self.processes[index];
         let is_live = self.options.mode == Mode::Live;
-        let kill_is_felt = self.killed.is_some_and(|killed| killed.elapsed() < KILL_IS_FELT);
+        let is_after_kill = self.killed.is_some_and(|killed| killed.elapsed() < KILL_AFTERMATH);
         let max_restarts = self.config.supervisor.max_restarts;
-        if !is_live || !process.may_restart(&death, kill_is_felt, max_restarts) {
+        if !is_live || !process.may_restart(&death, is_after_kill, max_restarts) {
             return Some(EndOfRun::Failed(death.cause));
         }
         tracing::warn!("{}; restarting it", death.cause);
@@ -382,7 +382,7 @@ impl<'a> Supervisor<'a> {
 
     /// Counts of a process: from its last health, which may be a second old where it was killed, and for capture from
     /// the position that it writes with every frame.
-    fn counted(&self, index: usize) -> RunCounters {
+    fn counters_of(&self, index: usize) -> RunCounters {
         let mut counted = RunCounters::default();
         let Some(health) = self.processes[index].peer.last() else { return counted };
         match index {
@@ -423,7 +423,7 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Collects what is still in flight after the last frame.
-    fn settle(&mut self, ended: &EndOfRun, shutdown: &Shutdown) -> Result<(), RunError> {
+    fn drain(&mut self, ended: &EndOfRun, shutdown: &Shutdown) -> Result<(), RunError> {
         self.recorder.collect()?;
         if self.options.mode == Mode::Lockstep || matches!(ended, EndOfRun::Failed(_)) {
             return Ok(());
@@ -484,7 +484,7 @@ impl<'a> Supervisor<'a> {
     fn counters(&self) -> RunCounters {
         let peaks = self.processes.iter().filter_map(|p| Some(p.peer.last()?.peak_rss_bytes));
         let mut sums = self.of_ended;
-        [CAPTURE, TRACKER].into_iter().for_each(|index| sums.add(&self.counted(index)));
+        [CAPTURE, TRACKER].into_iter().for_each(|index| sums.add(&self.counters_of(index)));
         RunCounters {
             // A killed process leaves slightly older counts.
             frames_in: sums.frames_in.max(self.recorder.recording.num_poses() as u64),

@@ -38,9 +38,9 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), RunEr
     // After the thread that prepares keyframes was made, which keeps ordinary scheduling.
     let refusals = apply(&config.tracker.scheduling);
     refusals.iter().for_each(|refusal| tracing::warn!("tracker: {refusal}"));
-    shell.health.tell_scheduling(&refusals);
+    shell.health.report_scheduling(&refusals);
     shell.health.enter(ProcessState::Ready, "");
-    shell.health.tell_ready();
+    shell.health.notify_ready();
     let outcome = shell.track_until(shutdown);
     shell.health.end(&outcome, "stopped");
     outcome
@@ -111,7 +111,7 @@ impl<'a> Shell<'a> {
                 }
                 next = self.next_frame()?;
             }
-            self.look_for_silence();
+            self.check_for_silence();
             self.health.report();
         }
         Ok(())
@@ -245,7 +245,7 @@ impl<'a> Shell<'a> {
     }
 
     /// Live: reports when frames have stopped. The next frame ends the state.
-    fn look_for_silence(&mut self) {
+    fn check_for_silence(&mut self) {
         let periods = self.config.tracker.stale_periods;
         if self.mode == Mode::Live && self.order.is_silent(self.last_arrival_nanos, periods) {
             self.health.enter(ProcessState::Stale, SILENCE);

@@ -16,7 +16,7 @@ use crate::service::error_log::ErrorLog;
 /// Pause before a restart.
 const RESTART_PAUSE: Duration = Duration::from_secs(10);
 /// Most restarts: a process that fails more often will not recover.
-const MOST_RESTARTS: u32 = 3;
+const MAX_RESTARTS: u32 = 3;
 /// Longest wait for its end on request: a stopped process never ends.
 const LONGEST_END: Duration = Duration::from_millis(500);
 /// Addresses that wait to be printed.
@@ -52,10 +52,10 @@ impl ViewChild {
     }
 
     /// Restarts it when due, and returns the address that it has printed, once.
-    pub fn look(&mut self) -> Option<String> {
+    pub fn poll(&mut self) -> Option<String> {
         let Some((child, lines)) = &mut self.running else {
             let is_due = self.ended.is_some_and(|ended| ended.elapsed() >= RESTART_PAUSE);
-            if is_due && self.restarts < MOST_RESTARTS {
+            if is_due && self.restarts < MAX_RESTARTS {
                 self.restarts += 1;
                 self.running = spawn(&self.options)
                     .inspect_err(|error| {
@@ -68,7 +68,7 @@ impl ViewChild {
         };
         let line = lines.try_recv().ok();
         if let Ok(Some(status)) = child.try_wait() {
-            let next = if self.restarts < MOST_RESTARTS {
+            let next = if self.restarts < MAX_RESTARTS {
                 "and the page is restarted"
             } else {
                 "without the page"

@@ -8,6 +8,7 @@
 pub mod candidate;
 pub mod common_error;
 pub mod epipolar;
+pub(crate) mod expected_gain;
 pub(crate) mod gain;
 pub mod gaussian;
 pub mod gradient_image;
@@ -22,7 +23,6 @@ mod neighbour_sums;
 mod patch_kernel;
 pub(crate) mod pattern;
 pub mod pose_noise;
-pub(crate) mod promise;
 pub mod propagation;
 pub mod regularisation;
 mod segment;

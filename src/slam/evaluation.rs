@@ -154,7 +154,7 @@ mod tests {
     fn transformed(poses: &[StampedPose], by: &Sim3) -> Vec<StampedPose> {
         let place = |pose: &StampedPose| StampedPose {
             nanos: pose.nanos,
-            world_from_camera: by.place(&pose.world_from_camera),
+            world_from_camera: by.transform_pose(&pose.world_from_camera),
         };
         poses.iter().map(place).collect()
     }

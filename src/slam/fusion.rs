@@ -29,7 +29,7 @@ use crate::slam::fusion::neighbours::neighbours;
 use crate::slam::fusion::normal::normal;
 use crate::slam::fusion::order::progressive_order;
 use crate::slam::fusion::spacing::spaced;
-use crate::slam::fusion::view::{Opinion, Sight, View};
+use crate::slam::fusion::view::{Projection, Verdict, View};
 use crate::slam::fusion::voxels::{Cell, Gathered, gathered, merged};
 use crate::slam::keyframe::{DepthPoint, Keyframe};
 
@@ -87,8 +87,8 @@ fn seen_by(
     params: &FusionParams,
 ) -> Vec<Gathered> {
     let view = &views[number];
-    let sights: Vec<Sight<'_>> =
-        neighbours.iter().map(|&other| Sight::new(view, &views[other])).collect();
+    let sights: Vec<Projection<'_>> =
+        neighbours.iter().map(|&other| Projection::new(view, &views[other])).collect();
     let points = view.keyframe.points.iter().enumerate();
     let gathered = points.filter_map(|(i, point)| {
         let fused = fused(view, &sights, point, params)?;
@@ -107,7 +107,7 @@ struct Fused {
 
 fn fused(
     view: &View<'_>,
-    sights: &[Sight<'_>],
+    sights: &[Projection<'_>],
     point: &DepthPoint,
     params: &FusionParams,
 ) -> Option<Fused> {
@@ -123,15 +123,15 @@ fn fused(
     let (mut weight, mut sum, mut least) = (1.0 / variance, d / variance, variance);
     let (mut agreeing, mut seeing_through, mut hiding) = (1u8, 0u8, 0u8);
     for sight in sights {
-        match sight.opinion(&ray, [d, variance], params) {
-            Some(Opinion::Agrees(other, of_other)) if of_other > 0.0 => {
+        match sight.verdict(&ray, [d, variance], params) {
+            Some(Verdict::Agrees(other, of_other)) if of_other > 0.0 => {
                 weight += 1.0 / of_other;
                 sum += other / of_other;
                 least = least.min(of_other);
                 agreeing = agreeing.saturating_add(1);
             }
-            Some(Opinion::SeesThrough) => seeing_through = seeing_through.saturating_add(1),
-            Some(Opinion::Hides) => hiding = hiding.saturating_add(1),
+            Some(Verdict::SeesThrough) => seeing_through = seeing_through.saturating_add(1),
+            Some(Verdict::Hides) => hiding = hiding.saturating_add(1),
             _ => {}
         }
     }

@@ -7,8 +7,8 @@ use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
+use crate::slam::keyframe_pose_covariance::{KeyframePoseCovariance, UncertainPose};
 use crate::slam::modes::ModeCovariance;
-use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
 use crate::slam::places::Description;
 
 /// One pixel with depth, as sent over the wire.
@@ -100,7 +100,7 @@ pub struct Keyframe {
     pub mode_covariance: ModeCovariance,
     /// Covariance of its pose in the map, relative to the keyframes that were held when it was estimated; zero for the
     /// first one of an epoch.
-    pub place_covariance: PlaceCovariance,
+    pub place_covariance: KeyframePoseCovariance,
     /// Whether its depth was observed again in the surrounding keyframes, which is done once.
     pub is_refined: bool,
     /// Pixels with depth in row-major order, at most [`MAX_KEYFRAME_POINTS`].
@@ -128,7 +128,7 @@ impl Keyframe {
             map_from_keyframe: place,
             map_revision: 0,
             mode_covariance: ModeCovariance::ZERO,
-            place_covariance: PlaceCovariance::ZERO,
+            place_covariance: KeyframePoseCovariance::ZERO,
             is_refined: false,
             intrinsics,
             image: image.into(),
@@ -138,9 +138,9 @@ impl Keyframe {
     }
 
     /// Its pose in the map, with the covariance.
-    pub fn uncertain_place(&self) -> UncertainPlace {
+    pub fn uncertain_pose(&self) -> UncertainPose {
         let Self { map_from_keyframe, place_covariance: covariance, .. } = *self;
-        UncertainPlace { map_from_keyframe, covariance }
+        UncertainPose { map_from_keyframe, covariance }
     }
 }
 

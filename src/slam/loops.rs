@@ -8,8 +8,8 @@
 
 mod chain;
 mod closure;
-pub(crate) mod known;
 mod likeness;
+pub(crate) mod record;
 mod search;
 #[cfg(test)]
 mod tests;
@@ -24,13 +24,13 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::constraint::Refusal;
 use crate::slam::keyframe::Keyframe;
-use crate::slam::loops::likeness::Likeness;
+use crate::slam::loops::likeness::AppearanceIndex;
 use crate::slam::map::Map;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::places::PlaceCandidate;
 
 pub use closure::Closure;
-pub use known::{KnownLoops, Link};
+pub use record::{Link, LoopRecord};
 
 /// Tuning of the search for loops.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -62,7 +62,7 @@ impl LoopParams {
 
 /// The outcome of a search.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum SearchFate {
+pub enum SearchOutcome {
     /// No candidate is the same place; the reason for the first one.
     Refused(Refusal),
     /// A candidate is plausible and is to be confirmed.
@@ -74,7 +74,7 @@ pub enum SearchFate {
     /// Together with the earlier loops it contradicts the map.
     Inconsistent,
     /// The map already agrees with it: it is kept as a constraint.
-    Held,
+    AlreadyConsistent,
     /// The map is corrected.
     Closed,
     /// Two epochs are joined.
@@ -93,7 +93,7 @@ pub struct SearchReport {
     /// Pairs that were measured.
     pub compared: u32,
     /// Its outcome.
-    pub fate: SearchFate,
+    pub outcome: SearchOutcome,
     /// The last pair whose measurement was accepted: ids of i and j, with `j_from_i`.
     pub measured: Option<(u64, u64, Sim3)>,
 }
@@ -158,13 +158,13 @@ fn find(keyframes: &[Keyframe], id: u64) -> Option<&Keyframe> {
 pub struct Loops {
     params: LoopParams,
     intrinsics: Intrinsics,
-    likeness: Likeness,
+    likeness: AppearanceIndex,
     /// By keyframe: those that it was estimated with, older and newer.
     partners: BTreeMap<u64, BTreeSet<u64>>,
     /// First keyframes of epochs, including joined ones: those on either side have different views.
     epoch_starts: BTreeSet<u64>,
     /// Shared with the map that stores it.
-    known: Arc<KnownLoops>,
+    record: Arc<LoopRecord>,
     plan: Option<Plan>,
     job: Option<Box<Job>>,
     closure: Option<Closure>,
@@ -181,10 +181,10 @@ impl Loops {
         Self {
             params,
             intrinsics,
-            likeness: Likeness::default(),
+            likeness: AppearanceIndex::default(),
             partners: BTreeMap::new(),
             epoch_starts: BTreeSet::new(),
-            known: Arc::default(),
+            record: Arc::default(),
             plan: None,
             job: None,
             closure: None,
@@ -229,23 +229,23 @@ impl Loops {
         }
         let before = others.iter().rev().filter(|other| !held.contains(other)).take(NUM_BEFORE);
         let against: Vec<u64> = held.iter().chain(before).copied().collect();
-        Arc::make_mut(&mut self.known).held_by.insert(newest, against);
+        Arc::make_mut(&mut self.record).held_by.insert(newest, against);
     }
 
     /// Continues from the loops that an earlier mapper stored for these keyframes. Those already searched, and those
     /// without a record of what they were estimated with, can be found but are not searched.
-    pub fn take_up(&mut self, known: Arc<KnownLoops>, keyframes: &[Keyframe]) {
+    pub fn resume_from(&mut self, known: Arc<LoopRecord>, keyframes: &[Keyframe]) {
         self.partners = known.partners();
-        self.known = known;
-        let last = self.known.last_searched(keyframes);
-        if self.known.searched_to != last {
-            Arc::make_mut(&mut self.known).searched_to = last;
+        self.record = known;
+        let last = self.record.last_searched(keyframes);
+        if self.record.searched_to != last {
+            Arc::make_mut(&mut self.record).searched_to = last;
         }
     }
 
     /// The loops found so far, to be stored with the map.
-    pub fn known(&self) -> &Arc<KnownLoops> {
-        &self.known
+    pub fn record(&self) -> &Arc<LoopRecord> {
+        &self.record
     }
 
     /// Plans the next step. `known` are the keyframes with image and depth, in order of their ids; those from
@@ -257,9 +257,9 @@ impl Loops {
             return;
         }
         self.likeness.enter(known);
-        self.known.searched_to.into_iter().for_each(|to| self.likeness.forget(to));
+        self.record.searched_to.into_iter().for_each(|to| self.likeness.forget(to));
         for (place, &of) in known.iter().enumerate().take(num_settled) {
-            if self.known.searched_to.is_some_and(|to| of <= to) {
+            if self.record.searched_to.is_some_and(|to| of <= to) {
                 continue;
             }
             let is_after = |id| known[place.saturating_sub(PAUSE)..place].contains(&id);
@@ -272,7 +272,7 @@ impl Loops {
                 self.plan = Some(Plan { of, stage: Stage::Search, pairs, likeness });
                 return;
             }
-            self.searched(of);
+            self.mark_searched(of);
         }
     }
 
@@ -321,19 +321,21 @@ impl Loops {
     pub fn run(&mut self) -> bool {
         let Some(job) = self.job.take() else { return false };
         let of = job.plan.of;
-        let (other, (compared, fate)) = match &job.plan.stage {
+        let (other, (compared, outcome)) = match &job.plan.stage {
             Stage::Search => (job.plan.pairs.first().map(|pair| pair.j), self.search(&job)),
             Stage::Confirm(link) => (Some(link.j), self.confirm(&job, link)),
             Stage::Close { num_newest } => (None, (0, self.solve(&job, *num_newest))),
         };
-        if fate != SearchFate::Proposed && self.known.searched_to.is_none_or(|to| to < of) {
-            self.searched(of);
+        if outcome != SearchOutcome::Proposed && self.record.searched_to.is_none_or(|to| to < of) {
+            self.mark_searched(of);
         }
-        let is_fruitless = matches!(fate, SearchFate::Refused(_) | SearchFate::AgainstDrift(_));
+        let is_fruitless =
+            matches!(outcome, SearchOutcome::Refused(_) | SearchOutcome::AgainstDrift(_));
         self.fruitless = is_fruitless.then_some(of);
         let (measured, likeness) = (self.measured.take(), job.plan.likeness);
         let keyframe_id = of;
-        self.report = Some(SearchReport { keyframe_id, other, likeness, compared, fate, measured });
+        self.report =
+            Some(SearchReport { keyframe_id, other, likeness, compared, outcome, measured });
         true
     }
 
@@ -351,13 +353,13 @@ impl Loops {
     pub fn repeat_closure(&mut self) {
         let Some(closure) = self.closure.take() else { return };
         let num_newest = confirmations(closure.join.is_none()) + 1;
-        let of = self.known.links.last().map_or(0, |link| link.i);
+        let of = self.record.links.last().map_or(0, |link| link.i);
         let stage = Stage::Close { num_newest };
         self.plan = Some(Plan { of, stage, pairs: Vec::new(), likeness: 0.0 });
     }
 
-    fn searched(&mut self, keyframe_id: u64) {
-        Arc::make_mut(&mut self.known).searched_to = Some(keyframe_id);
+    fn mark_searched(&mut self, keyframe_id: u64) {
+        Arc::make_mut(&mut self.record).searched_to = Some(keyframe_id);
         self.likeness.forget(keyframe_id);
     }
 }

@@ -13,9 +13,9 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
-use crate::slam::loops::known::KnownLoops;
+use crate::slam::keyframe_pose_covariance::KeyframePoseCovariance;
+use crate::slam::loops::record::LoopRecord;
 use crate::slam::modes::ModeCovariance;
-use crate::slam::place_covariance::PlaceCovariance;
 
 /// All keyframes of all epochs, with their depth. Each epoch has its own scale and drift.
 #[derive(Debug, Clone, Default)]
@@ -23,11 +23,11 @@ pub struct Map {
     /// Keyframes in order of creation.
     pub keyframes: Vec<Keyframe>,
     /// Frames that were aligned again after tracking, in order of their sequence.
-    pub frames: Vec<FramePlace>,
+    pub frames: Vec<FramePose>,
     /// Points of the joint estimation; only in a complete map.
     pub confirmed: Vec<ConfirmedPoint>,
     /// Loops, and the keyframes that each keyframe was estimated against.
-    pub loops: Arc<KnownLoops>,
+    pub loops: Arc<LoopRecord>,
     /// Number of corrections of the map.
     pub revision: u64,
     /// The keyframe that was active; only in a checkpoint.
@@ -38,7 +38,7 @@ pub struct Map {
 
 /// The pose of a frame relative to its keyframe.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FramePlace {
+pub struct FramePose {
     /// Its sequence.
     pub sequence: u64,
     /// The keyframe.
@@ -49,7 +49,7 @@ pub struct FramePlace {
 
 /// The pose of a frame after it was aligned again.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PlacedFrame {
+pub struct RealignedFrame {
     /// Its sequence.
     pub sequence: u64,
     /// Its keyframe.
@@ -109,7 +109,7 @@ pub struct KeyframeCorrection {
     /// Covariance of the errors common to its depth after that; `None` leaves it unchanged.
     pub modes: Option<ModeCovariance>,
     /// Covariance of the new pose; `None` transports that of the old one.
-    pub place: Option<PlaceCovariance>,
+    pub place: Option<KeyframePoseCovariance>,
 }
 
 /// A smooth correction of inverse depth: d ← d · exp(offset + per_x X + per_y Y), X and Y the coordinates of the
@@ -153,7 +153,7 @@ pub enum CorrectionError {
 
 impl KeyframeCorrection {
     /// A new pose only.
-    pub fn of_place(keyframe_id: u64, map_from_keyframe: Sim3) -> Self {
+    pub fn of_pose(keyframe_id: u64, map_from_keyframe: Sim3) -> Self {
         let depth = LogPlane::default();
         Self { keyframe_id, map_from_keyframe, depth, modes: None, place: None }
     }
@@ -217,7 +217,7 @@ impl Map {
     }
 
     /// Keyframes that have not been reduced to their poses.
-    pub fn num_held(&self) -> usize {
+    pub fn num_with_depth(&self) -> usize {
         self.keyframes.iter().filter(|keyframe| !keyframe.image.is_empty()).count()
     }
 
@@ -227,17 +227,17 @@ impl Map {
     }
 
     /// `map_from_camera` of a frame whose pose relative to a keyframe is given.
-    pub fn place(&self, keyframe_id: u64, keyframe_from_camera: &SE3) -> Option<SE3> {
-        Some(self.get(keyframe_id)?.map_from_keyframe.place(keyframe_from_camera))
+    pub fn frame_pose(&self, keyframe_id: u64, keyframe_from_camera: &SE3) -> Option<SE3> {
+        Some(self.get(keyframe_id)?.map_from_keyframe.transform_pose(keyframe_from_camera))
     }
 
     /// Stores the pose of a frame that was aligned again.
-    pub fn place_frame(&mut self, placed: &PlacedFrame) {
+    pub fn store_frame_pose(&mut self, placed: &RealignedFrame) {
         let Some(keyframe) = self.get(placed.keyframe_id) else { return };
         let mut keyframe_from_camera = placed.keyframe_from_camera;
         keyframe_from_camera.translation /= keyframe.map_from_keyframe.scale;
-        let PlacedFrame { sequence, keyframe_id, .. } = *placed;
-        let frame = FramePlace { sequence, keyframe_id, keyframe_from_camera };
+        let RealignedFrame { sequence, keyframe_id, .. } = *placed;
+        let frame = FramePose { sequence, keyframe_id, keyframe_from_camera };
         match self.frames.binary_search_by_key(&sequence, |known| known.sequence) {
             Ok(known) => self.frames[known] = frame,
             Err(place) => self.frames.insert(place, frame),
@@ -245,7 +245,7 @@ impl Map {
     }
 
     /// The pose of a frame, if it was aligned again.
-    pub fn frame(&self, sequence: u64) -> Option<&FramePlace> {
+    pub fn frame(&self, sequence: u64) -> Option<&FramePose> {
         let place = self.frames.binary_search_by_key(&sequence, |known| known.sequence).ok()?;
         self.frames.get(place)
     }
@@ -263,7 +263,8 @@ impl Map {
         let of_epoch = self.keyframes.iter().enumerate().filter(move |(_, k)| k.epoch == epoch);
         of_epoch.filter(|(_, keyframe)| keyframe.has_depth()).filter_map(
             move |(index, keyframe)| {
-                let keyframe_from_camera = keyframe.map_from_keyframe.locate(&map_from_camera);
+                let keyframe_from_camera =
+                    keyframe.map_from_keyframe.inverse_transform_pose(&map_from_camera);
                 let distance = keyframe_from_camera.translation.norm();
                 (distance < max_distance).then(|| {
                     let usage = keyframe.usage(&keyframe_from_camera);

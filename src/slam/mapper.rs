@@ -75,7 +75,7 @@ pub struct StepOutcome {
 
 impl StepOutcome {
     /// A map was started with its first keyframes.
-    fn begun() -> Self {
+    fn map_started() -> Self {
         Self {
             keyframe_created: true,
             keyframe_changed: true,
@@ -85,7 +85,7 @@ impl StepOutcome {
     }
 
     /// An earlier keyframe is active again.
-    fn restored(graph_changed: bool) -> Self {
+    fn keyframe_restored(graph_changed: bool) -> Self {
         Self { keyframe_restored: true, keyframe_changed: true, graph_changed, ..Self::default() }
     }
 
@@ -217,13 +217,17 @@ impl Mapper {
         let finished = self.finish_keyframe();
         self.start.last_frame = None;
         self.copies.begin_frame();
-        let outcome = self.take_in(&StepInput { frame, pose, sensor_depth }, change_begins);
-        let is_told = self.tell_doubt();
+        let outcome = self.step_inner(&StepInput { frame, pose, sensor_depth }, change_begins);
+        let is_told = self.publish_doubt();
         let keyframe_changed = outcome.keyframe_changed || finished.keyframe_changed || is_told;
         StepOutcome { keyframe_changed, ..outcome }
     }
 
-    fn take_in(&mut self, input: &StepInput<'_>, change_begins: &mut dyn FnMut()) -> StepOutcome {
+    fn step_inner(
+        &mut self,
+        input: &StepInput<'_>,
+        change_begins: &mut dyn FnMut(),
+    ) -> StepOutcome {
         let StepInput { frame, pose, .. } = *input;
         if !frame.is_consistent()
             || (frame.width, frame.height) != (self.intrinsics.width, self.intrinsics.height)
@@ -276,12 +280,15 @@ impl Mapper {
     /// Uses a tracked frame: observes depth, judges the map, then changes the keyframe or remembers the frame.
     fn extend(&mut self, input: &StepInput<'_>, change_begins: &mut dyn FnMut()) -> StepOutcome {
         let StepInput { frame, pose, .. } = *input;
-        self.keep_frame(frame, pose);
+        self.queue_frame(frame, pose);
         self.guess_unit(&pose.keyframe_from_camera);
         let (unit, modes) = (self.depth.unit, &self.params.modes);
-        self.modes.consider(&self.depth.active, unit, &self.intrinsics, pose, modes);
+        self.modes.begin_frame(&self.depth.active, unit, &self.intrinsics, pose, modes);
         let observations = self.observe_frame(frame, pose);
-        self.modes.observed(&self.depth.active, &in_unit(&pose.keyframe_from_camera, unit));
+        self.modes.update_after_observation(
+            &self.depth.active,
+            &in_unit(&pose.keyframe_from_camera, unit),
+        );
         self.depth.unpublished += observations.fused + observations.created;
         let points = self.num_points();
         let Some(active) = &mut self.active else { return StepOutcome::default() };
@@ -290,7 +297,7 @@ impl Mapper {
         if let Some(rejected) = self.judge_frame(&observations, pose) {
             return rejected;
         }
-        if pose.proposes_keyframe && due && !self.leaves_depth_behind(frame, pose) {
+        if pose.proposes_keyframe && due && !self.would_lose_depth(frame, pose) {
             change_begins();
             let is_reused = self.reuse_keyframe(frame, pose);
             if !is_reused {
@@ -333,9 +340,9 @@ impl Mapper {
     }
 
     /// Frees the frames that only later frames need: call it before the last estimate, when no frame will follow.
-    pub fn give_back_frames(&mut self) {
+    pub fn free_frames(&mut self) {
         self.past.clear();
-        self.copies.let_go();
+        self.copies.free_unused();
     }
 
     /// Consumes the mapper and returns its map.
@@ -367,7 +374,7 @@ impl Mapper {
     }
 
     /// Writes the final depth of the active keyframe, unless its map is rejected, before it is left.
-    fn leave_keyframe(&mut self) {
+    fn deactivate_keyframe(&mut self) {
         let is_rejected = self.keyframe().is_some_and(|k| k.map_state == MapState::Rejected);
         if self.depth.unpublished > 0 && !is_rejected {
             self.publish_depth();
@@ -375,23 +382,23 @@ impl Mapper {
     }
 
     /// Makes a keyframe of the map the active one, placed in the world by `world_from_map`.
-    fn enter_keyframe(&mut self, index: usize) {
+    fn activate_keyframe(&mut self, index: usize) {
         if let Some(left) = self.keyframe().map(|keyframe| keyframe.keyframe_id) {
-            self.tell_left(left);
+            self.queue_keyframe_to_save(left);
         }
         self.active = Some(Active::new(index));
         if let Some(keyframe) = self.map.keyframes.get(index) {
             self.modes.enter(&keyframe.mode_covariance, &self.params.modes);
         }
         self.depth.unpublished = 0;
-        self.depth.plant_points(&self.params);
+        self.depth.choose_traced_points(&self.params);
         self.publish_depth();
     }
 
     /// Writes the active depth, the pose in the world and the revisions into the active keyframe.
     fn publish_depth(&mut self) {
         self.revision += 1;
-        self.publish_place();
+        self.publish_pose();
         let Some(active) = &self.active else { return };
         let Some(keyframe) = self.map.keyframes.get_mut(active.index) else { return };
         write_depth(&self.depth.active, self.depth.unit, keyframe);
@@ -399,7 +406,7 @@ impl Mapper {
     }
 
     /// Writes the pose in the world and the revisions into the active keyframe.
-    fn publish_place(&mut self) {
+    fn publish_pose(&mut self) {
         let (revision, map_revision) = (self.revision, self.map.revision);
         let world_from_map = self.world_from_map;
         let Some(keyframe) = self.keyframe_mut() else { return };

@@ -111,12 +111,12 @@ impl Odometry {
         let mut outcome = self.mapper.step(frame, &pose, None, &mut || {});
         outcome.keyframe_changed |= self.mapper.finish_keyframe().keyframe_changed;
         self.frames += 1;
-        outcome.keyframe_changed |= self.let_in().keyframe_changed;
+        outcome.keyframe_changed |= self.apply_estimate().keyframe_changed;
         self.begin();
         // An estimate may be due with its own frame.
-        outcome.keyframe_changed |= self.let_in().keyframe_changed;
+        outcome.keyframe_changed |= self.apply_estimate().keyframe_changed;
         if outcome.needs_publishing() {
-            self.hand_on_keyframe();
+            self.pass_keyframe_to_tracker();
         }
         pose
     }
@@ -133,8 +133,8 @@ impl Odometry {
             self.end_estimate();
         }
         while self.mapper.refine_depth() {}
-        self.mapper.keep_confirmed();
-        self.hand_on_keyframe();
+        self.mapper.store_confirmed_points();
+        self.pass_keyframe_to_tracker();
     }
 
     /// All keyframes, in order of creation: image, inverse depth with variance, pose in the map.
@@ -169,7 +169,7 @@ impl Odometry {
         self.estimate = Some(Estimate { window, due, epoch, map_revision });
     }
 
-    fn let_in(&mut self) -> StepOutcome {
+    fn apply_estimate(&mut self) -> StepOutcome {
         match self.estimate.as_ref().is_some_and(|estimate| self.frames >= estimate.due) {
             true => self.end_estimate(),
             false => StepOutcome::default(),
@@ -192,7 +192,7 @@ impl Odometry {
     }
 
     /// Hands the mapper's keyframe to the tracker, in the memory of the previous one.
-    fn hand_on_keyframe(&mut self) {
+    fn pass_keyframe_to_tracker(&mut self) {
         let Some(keyframe) = self.mapper.keyframe() else { return };
         let new = || Box::new(Reference::new(self.params.tracker.reference.clone()));
         let mut reference = self.spare.take().unwrap_or_else(new);

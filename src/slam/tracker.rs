@@ -18,18 +18,18 @@ use crate::slam::alignment::reference::{
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::sums::{LEAST_CONTRAST, SumPyramid};
+use crate::slam::image::sums::{MIN_CONTRAST, SumPyramid};
 use crate::slam::keyframe::{DistanceWeights, MapState};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{Brightness, DegradedReason, LostReason, PoseEstimate, TrackingState};
 use crate::slam::tracker::covariance_floor::CovarianceFloorParams;
-use crate::slam::tracker::motion::{Motion, hypotheses, turned};
+use crate::slam::tracker::motion::{Motion, hypotheses, rotations_around};
 use crate::slam::tracker::turning::{Turning, may_turn};
 use crate::slam::tracker::velocity::VelocityMemory;
 use crate::slam::tracker::verdict::{VerdictParams, fits_better, is_better, quality_of};
 
 /// Standard deviations by which a pose may differ from the held one: one of a hundred correct finds is refused.
-pub const MOST_DEVIATIONS: f64 = 3.0;
+pub const MAX_POSE_DEVIATIONS: f64 = 3.0;
 
 /// Tuning of the tracker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -77,7 +77,7 @@ impl Default for TrackerParams {
             hypothesis_rotation_deg: 3.0,
             recovery_rotation_deg: 6.0,
             max_turning_deviation: 1.0,
-            min_contrast: LEAST_CONTRAST,
+            min_contrast: MIN_CONTRAST,
             keyframe_distance_weight: DistanceWeights::default().translation,
             keyframe_usage_weight: DistanceWeights::default().usage,
             keyframe_brightness_ratio: 1.6,
@@ -172,7 +172,7 @@ impl Tracker {
     /// epoch resets the camera's motion.
     pub fn adopt(&mut self, reference: Box<Reference>) -> Option<Box<Reference>> {
         /// Frames by which a mapper may lag with the first keyframe of an epoch: ten seconds at 30 Hz.
-        const MOST_FRAMES_BEHIND: u64 = 300;
+        const MAX_FRAMES_BEHIND: u64 = 300;
         let before = self.reference.replace(reference);
         let (old, new) = (before.as_deref(), self.reference.as_deref());
         if let (Some(old), Some(new)) = (old, new) {
@@ -185,7 +185,7 @@ impl Tracker {
                 // camera may be anywhere.
                 let age =
                     self.memory.last_sequence.and_then(|last| last.checked_sub(new.sequence()));
-                self.memory.was_lost = age.is_none_or(|age| age > MOST_FRAMES_BEHIND);
+                self.memory.was_lost = age.is_none_or(|age| age > MAX_FRAMES_BEHIND);
                 self.turning.end();
             }
             if old.keyframe_id() == new.keyframe_id() {
@@ -343,7 +343,7 @@ impl Tracker {
     ) -> (Alignment, Option<f64>) {
         let nanos = frame.capture_nanos;
         // Before the first pose the camera is assumed to be where the keyframe was taken.
-        let first = reference.world_from_keyframe().place(&SE3::identity());
+        let first = reference.world_from_keyframe().transform_pose(&SE3::identity());
         let predicted = self.memory.motion.predict(nanos, 1.0).unwrap_or(first);
         let mut best = self.align_coarsest(reference, &predicted, budget);
         if self.fits_poorly(&best) {
@@ -351,8 +351,9 @@ impl Tracker {
             // A lost camera may be where the keyframe was taken: the mapper may have found it there.
             let views = self.params.recovery_rotation_deg.to_radians();
             let at_keyframe =
-                self.memory.was_lost.then(|| turned(&first, views)).into_iter().flatten();
-            let explain = |of: &Alignment| self.aligner.explanation(reference, &self.pyramid, of);
+                self.memory.was_lost.then(|| rotations_around(&first, views)).into_iter().flatten();
+            let explain =
+                |of: &Alignment| self.aligner.sums_with_exact_depth(reference, &self.pyramid, of);
             let mut explained = explain(&best);
             // A small gain explains any image, and would hide the pose that may be claimed.
             let may_be = |of: &Alignment| !self.memory.was_lost || self.params.verdict.is_near(of);
@@ -399,11 +400,11 @@ impl Tracker {
         }
         // A level takes only pose and brightness from its start.
         direct.state.current_from_keyframe =
-            reference.world_from_keyframe().locate(predicted).inverse();
+            reference.world_from_keyframe().inverse_transform_pose(predicted).inverse();
         direct.state.brightness = self.memory.brightness;
         direct.ending = Ending::NothingInView;
         aligner.solve_level(reference, frame, level, &mut direct, budget);
-        let explain = |of: &Alignment| aligner.explanation(reference, frame, of);
+        let explain = |of: &Alignment| aligner.sums_with_exact_depth(reference, frame, of);
         let is_solved = direct.ending == Ending::Finished;
         match is_solved && fits_better(&explain(&direct), &explain(&coarsest)) {
             true => direct,
@@ -419,15 +420,16 @@ impl Tracker {
         cut_short: &Alignment,
         predicted: &SE3,
     ) -> Alignment {
-        let guess = reference.world_from_keyframe().locate(predicted).inverse();
+        let guess = reference.world_from_keyframe().inverse_transform_pose(predicted).inverse();
         let reached = &cut_short.state.current_from_keyframe;
         let brightnesses = [cut_short.state.brightness, self.memory.brightness];
         let [reached, guessed] =
             [(reached, brightnesses[0]), (&guess, brightnesses[1])].map(|(pose, brightness)| {
                 let (aligner, frame) = (&self.aligner, &self.pyramid);
-                aligner.stand_on_finest(reference, frame, cut_short, pose, brightness)
+                aligner.evaluate_on_finest(reference, frame, cut_short, pose, brightness)
             });
-        let explain = |of: &Alignment| self.aligner.explanation(reference, &self.pyramid, of);
+        let explain =
+            |of: &Alignment| self.aligner.sums_with_exact_depth(reference, &self.pyramid, of);
         let better = |one: Alignment, other: Alignment| {
             if fits_better(&explain(&one), &explain(&other)) { one } else { other }
         };
@@ -435,7 +437,7 @@ impl Tracker {
         // The sums are available: the step costs one evaluation.
         let Some((pose, brightness)) = best.state.after_step() else { return best };
         let (aligner, frame) = (&self.aligner, &self.pyramid);
-        better(aligner.stand_on_finest(reference, frame, cut_short, &pose, brightness), best)
+        better(aligner.evaluate_on_finest(reference, frame, cut_short, &pose, brightness), best)
     }
 
     /// Solves the coarsest level that has points, from one pose in the world.
@@ -445,7 +447,8 @@ impl Tracker {
         world_from_camera: &SE3,
         budget: &mut dyn FnMut(usize) -> bool,
     ) -> Alignment {
-        let start = reference.world_from_keyframe().locate(world_from_camera).inverse();
+        let start =
+            reference.world_from_keyframe().inverse_transform_pose(world_from_camera).inverse();
         let (aligner, pyramid) = (&self.aligner, &self.pyramid);
         let mut alignment = aligner.start(reference, pyramid, &start, self.memory.brightness);
         let level = alignment.level;
@@ -466,7 +469,7 @@ impl Tracker {
 }
 
 #[cfg(test)]
-mod hostile_tests;
+mod arbitrary_input_tests;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]

@@ -349,12 +349,12 @@ impl TwoFrameInitializer {
     fn needs_slopes(&mut self) -> bool {
         /// Share of the energy that slopes must explain: at most 0.03 in recordings with even light, 0.06 in single
         /// blurred frames; up to 0.27 where the corners lose half of their light, once the image has moved.
-        const LEAST_SHARE: f64 = 0.06;
+        const MIN_SHARE: f64 = 0.06;
         if self.rotation.gain_slopes.is_some() {
             return false;
         }
         let input = input(self.pyramid.levels(), &self.intrinsics, &self.points);
-        self.joint.promised_by_slopes(&input, &self.params.fit) > LEAST_SHARE
+        self.joint.predicted_decrease_by_slopes(&input, &self.params.fit) > MIN_SHARE
     }
 
     /// Lets the gain vary over the image until the end of this start, in the previous frames as well.

@@ -23,13 +23,13 @@ const CONES: [f64; 4] = [20.0 * DEGREE, 15.0 * DEGREE, 10.0 * DEGREE, 10.0 * DEG
 const ROUNDS: usize = 4;
 
 /// Most normals that are used: more do not change the direction.
-const MOST_NORMALS: usize = 20_000;
+const MAX_NORMALS: usize = 20_000;
 
 /// Most normals that are tried as the initial direction.
-const MOST_STARTS: usize = 200;
+const MAX_STARTS: usize = 200;
 
 /// Fewest normals of a surface.
-const FEWEST_NORMALS: usize = 100;
+const MIN_NORMALS: usize = 100;
 
 const DEGREE: f64 = std::f64::consts::PI / 180.0;
 
@@ -43,7 +43,7 @@ pub fn up_direction<'a>(
     normals: impl ExactSizeIterator<Item = [f32; 3]>,
 ) -> Option<Vector3<f64>> {
     let mean = mean_up(poses)?;
-    let every = normals.len().div_ceil(MOST_NORMALS).max(1);
+    let every = normals.len().div_ceil(MAX_NORMALS).max(1);
     let normals: Vec<Vector3<f64>> = normals
         .step_by(every)
         .filter_map(|normal| Vector3::from(normal.map(f64::from)).try_normalize(0.5))
@@ -78,7 +78,7 @@ fn shared_normal(
         .filter(|normal| normal.dot(mean) > least)
         .collect();
     let [.., cone] = CONES;
-    let every = upright.len().div_ceil(MOST_STARTS).max(1);
+    let every = upright.len().div_ceil(MAX_STARTS).max(1);
     let starts = upright.iter().step_by(every);
     let start = starts.max_by_key(|start| within(normals, start, cone).count())?;
     let mut up = *start;
@@ -91,7 +91,7 @@ fn shared_normal(
         up = sum.try_normalize(f64::EPSILON)?;
     }
     let count = within(normals, &up, cone).count();
-    let is_shared = count >= FEWEST_NORMALS && count as f64 >= share * normals.len() as f64;
+    let is_shared = count >= MIN_NORMALS && count as f64 >= share * normals.len() as f64;
     (is_shared && up.dot(mean) > least).then_some(up)
 }
 
@@ -176,7 +176,7 @@ mod tests {
         let mean = up_direction(poses.iter(), std::iter::empty()).unwrap();
         let mut normals = surface(Vector3::x(), 4000);
         normals.extend(surface(Vector3::z(), 4000));
-        normals.extend(surface(-Vector3::y(), FEWEST_NORMALS / 2));
+        normals.extend(surface(-Vector3::y(), MIN_NORMALS / 2));
         assert_eq!(up_direction(poses.iter(), normals.iter().copied()), Some(mean));
         let unknown = vec![[f32::NAN; 3]; 500];
         assert_eq!(up_direction(poses.iter(), unknown.iter().copied()), Some(mean));

@@ -87,7 +87,8 @@ pub struct Adjustment {
 }
 
 /// Keyframes and points that are estimated jointly. The window keeps its own copy of all it needs but the images, which
-/// never change, so that it can work during mapping; only [`Window::take_in`] and [`Window::correction`] meet the map.
+/// never change, so that it can work during mapping; only [`Window::update_from_map`] and [`Window::correction`] meet
+/// the map.
 #[derive(Debug, Clone)]
 pub struct Window {
     params: WindowParams,
@@ -146,11 +147,11 @@ impl Window {
 
     /// Updates the window from the map, whose keyframe `active` is still being observed. False where there is nothing
     /// new to estimate.
-    pub fn take_in(&mut self, map: &Map, active: u64) -> bool {
+    pub fn update_from_map(&mut self, map: &Map, active: u64) -> bool {
         self.moved.clear();
         self.marginals.clear();
         self.refuted_epoch = None;
-        self.pass.leave_piece();
+        self.pass.finish_piece();
         // Keyframes left by a mapper that died are where they were estimated to be.
         let is_resumed = self.keyframes.is_empty() && map.keyframes.len() > 1;
         let held: Vec<&Keyframe> = map.keyframes.iter().filter(|of| of.is_usable()).collect();
@@ -233,7 +234,7 @@ impl Window {
 
     /// Runs the task that was begun, or else estimates the newest keyframes and points; `None` without an estimate.
     pub fn optimise(&mut self) -> Option<Adjustment> {
-        if self.refine_begun() || self.search_begun() || self.frames_begun() {
+        if self.run_refinement() || self.run_search() || self.realign_planned_frames() {
             return None;
         }
         let mut is_new = false;
@@ -250,7 +251,7 @@ impl Window {
             let chosen = self.choose_members(newest);
             adjustment = self.adjust(&chosen);
             if adjustment.is_some() {
-                self.tell_estimate(&chosen);
+                self.report_estimate(&chosen);
             }
             if adjustment.is_some() && self.is_refuted(&chosen) {
                 self.refuted_epoch = Some(self.keyframes[newest].epoch);
@@ -259,12 +260,12 @@ impl Window {
             if self.refuted_epoch.is_none() {
                 self.plan_frames(newest, chosen.is_first);
             }
-            self.leave(&chosen.members);
+            self.free_unused_images(&chosen.members);
         }
         if std::mem::take(&mut self.is_last) {
             adjustment = self.adjust_all(newest).or(adjustment);
-            self.place_rest();
-            self.leave(&[]);
+            self.realign_rest();
+            self.free_unused_images(&[]);
             self.refinement.begin(&self.keyframes);
         } else if std::mem::take(&mut self.reconsiders) {
             adjustment = self.adjust_newest(newest).or(adjustment);
@@ -275,10 +276,10 @@ impl Window {
     }
 
     /// Frees the images of keyframes that no longer take part.
-    fn leave(&mut self, members: &[usize]) {
+    fn free_unused_images(&mut self, members: &[usize]) {
         for (index, keyframe) in self.keyframes.iter_mut().enumerate() {
             if !members.contains(&index) {
-                keyframe.leave();
+                keyframe.drop_pyramid();
             }
         }
     }
@@ -289,16 +290,17 @@ impl Window {
         let ready = self.candidates.extract_if(.., |of| of.keyframe_id < newest);
         for candidates in ready.collect::<Vec<_>>() {
             let Some(host) = self.index_of(candidates.keyframe_id) else { continue };
-            self.become_host(host, &candidates);
+            self.make_host(host, &candidates);
         }
     }
 
-    fn become_host(&mut self, host: usize, candidates: &Candidates) {
+    fn make_host(&mut self, host: usize, candidates: &Candidates) {
         // The candidates were traced with poses on the keyframe's depth: the plane applies to both.
-        let plane = plane::fit(&self.projected_into(host, &candidates.depth)).unwrap_or_default();
+        let plane = plane::fit(&self.projected_correspondences(host, &candidates.depth))
+            .unwrap_or_default();
         let params = &self.params;
         let keyframe = &mut self.keyframes[host];
-        keyframe.take_part(&self.camera);
+        keyframe.build_pyramid(&self.camera);
         let chosen = candidates.choose(keyframe.images[0].pixels(), &self.camera, params);
         keyframe.points = chosen
             .iter()
@@ -418,7 +420,7 @@ impl Window {
         mut may: impl FnMut(usize, usize) -> bool,
     ) -> bool {
         for &index in members.members {
-            self.keyframes[index].take_part(&self.camera);
+            self.keyframes[index].build_pyramid(&self.camera);
         }
         let robustness = self.robustness();
         let finest = num_levels(&self.camera) - 1;
@@ -426,7 +428,7 @@ impl Window {
             let at = Level { camera: &self.camera, level, robustness };
             let views = &mut self.solver.views;
             views.find(&self.keyframes, members.members, &self.camera, &mut may);
-            views.look(&self.keyframes, members.members, level);
+            views.sample_patterns(&self.keyframes, members.members, level);
             let converged = self.params.converged_decrement;
             self.solver.adjust(&mut self.keyframes, members, &at, iterations, converged)
         })

@@ -9,9 +9,9 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MAX_KEYFRAME_POINTS, MapState};
+use crate::slam::keyframe_pose_covariance::{KEYFRAME_POSE_ENTRIES, KeyframePoseCovariance};
 use crate::slam::mapper::situation::StartFrame;
 use crate::slam::modes::ModeCovariance;
-use crate::slam::place_covariance::{PLACE_ENTRIES, PlaceCovariance};
 use crate::slam::pose::{
     Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState, Velocity,
 };
@@ -407,7 +407,7 @@ pub fn keyframe_from_messages(
         map_from_keyframe: similarity_from_message(&header.map_from_keyframe, "map_from_keyframe")?,
         map_revision: header.map_revision,
         mode_covariance: mode_covariance_from_message(&header.mode_covariance)?,
-        place_covariance: place_covariance_from_message(&header.place_covariance)?,
+        place_covariance: pose_covariance_from_message(&header.place_covariance)?,
         is_refined: false,
         intrinsics,
         image: image.into(),
@@ -425,10 +425,10 @@ pub fn mode_covariance_from_message(
 }
 
 /// Returns the covariance of a keyframe's pose and unit from its upper triangle, checked.
-pub fn place_covariance_from_message(
-    upper_triangle: &[f64; PLACE_ENTRIES],
-) -> Result<PlaceCovariance, MessageError> {
-    PlaceCovariance::from_upper_triangle(*upper_triangle)
+pub fn pose_covariance_from_message(
+    upper_triangle: &[f64; KEYFRAME_POSE_ENTRIES],
+) -> Result<KeyframePoseCovariance, MessageError> {
+    KeyframePoseCovariance::from_upper_triangle(*upper_triangle)
         .ok_or(MessageError::InvalidNumber { field: "place_covariance" })
 }
 

@@ -7,7 +7,7 @@ use iceoryx2::prelude::ZeroCopySend;
 use zerocopy::{FromBytes, FromZeros, Immutable, IntoBytes, KnownLayout};
 
 use crate::slam::keyframe::DepthPoint;
-use crate::slam::place_covariance::PLACE_ENTRIES;
+use crate::slam::keyframe_pose_covariance::KEYFRAME_POSE_ENTRIES;
 
 /// Size of a text in a message, in bytes; longer texts are truncated.
 pub const TEXT_BYTES: usize = 192;
@@ -163,7 +163,7 @@ pub struct KeyframeHeader {
     pub mode_covariance: [f64; 6],
     /// Upper triangle, row-major, of the covariance of the keyframe's pose and unit: the left increment (translation,
     /// rotation) of the rigid part of `map_from_keyframe`, map units and radians, and the logarithm of its unit.
-    pub place_covariance: [f64; PLACE_ENTRIES],
+    pub place_covariance: [f64; KEYFRAME_POSE_ENTRIES],
     /// Epoch of the map.
     pub epoch: u32,
     /// State of the map: 1 established, 2 rejected.

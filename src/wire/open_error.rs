@@ -87,11 +87,11 @@ pub(in crate::wire) fn not_running(place: &Place) -> OpenError {
 }
 
 pub(in crate::wire) fn topic_error(name: &str, error: &dyn std::fmt::Display) -> OpenError {
-    OpenError::Topic { topic: name.to_owned(), reason: in_words(&error.to_string()) }
+    OpenError::Topic { topic: name.to_owned(), reason: explain(&error.to_string()) }
 }
 
 /// Explains an error that iceoryx2 gives by the name of a type, and says what the user can do about it.
-pub(in crate::wire) fn in_words(reason: &str) -> String {
+pub(in crate::wire) fn explain(reason: &str) -> String {
     const CAUSES: [(&[&str], &str); 4] = [
         (
             &["ExceedsMaxNumberOfNodes", "ExceedsMaxSupported"],
@@ -122,12 +122,12 @@ mod tests {
 
     #[test]
     fn names_of_types_are_explained() {
-        let hangs = in_words("PublishSubscribeOpenError::HangsInCreation");
+        let hangs = explain("PublishSubscribeOpenError::HangsInCreation");
         assert!(hangs.contains("--ipc=host") && hangs.ends_with("HangsInCreation)"), "{hangs}");
-        let files = in_words("EventCreateError(InternalFailure)");
+        let files = explain("EventCreateError(InternalFailure)");
         assert!(files.contains("ulimit -n"), "{files}");
-        let full = in_words("EventOpenError::ExceedsMaxNumberOfNodes");
+        let full = explain("EventOpenError::ExceedsMaxNumberOfNodes");
         assert!(full.starts_with("the instance has no room for another program"), "{full}");
-        assert_eq!(in_words("IncompatibleTypes"), "IncompatibleTypes");
+        assert_eq!(explain("IncompatibleTypes"), "IncompatibleTypes");
     }
 }

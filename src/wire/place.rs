@@ -101,7 +101,7 @@ impl Place {
         raise_open_files()?;
         self.create()?;
         // Keeps away a process that tidies up, which would hold the lock for a moment.
-        let _joining = self.hold()?;
+        let _joining = self.block_tidy()?;
         let path = self.claim_path_of(&self.instance, process);
         let io = |source| PlaceError::Io { path: path.clone(), source };
         match LockFile::take(&path, USER_ALONE).map_err(io)? {
@@ -138,7 +138,7 @@ impl Place {
 
     /// Removes the files that processes of this instance keep for their successors. Only while the supervisor is
     /// claimed and none of them runs.
-    pub fn forget_run(&self) {
+    pub fn remove_run_files(&self) {
         for path in self.kept_files() {
             // A file that cannot be removed is recognised as another run's by its key.
             let _ = fs::remove_file(path);
@@ -183,7 +183,7 @@ impl Place {
     }
 
     /// Keeps [`Place::tidy`] away while a process joins.
-    pub(in crate::wire) fn hold(&self) -> Result<File, PlaceError> {
+    pub(in crate::wire) fn block_tidy(&self) -> Result<File, PlaceError> {
         let path = self.root.join(JOIN_LOCK);
         let io = |source| PlaceError::Io { path: path.clone(), source };
         let end = Instant::now() + LONGEST_HOLD;

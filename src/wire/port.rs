@@ -25,7 +25,7 @@ use rustix::event::{PollFd, PollFlags, Timespec};
 use crate::wire::folders::SHARED_MEMORY;
 use crate::wire::limits::raise_open_files;
 pub use crate::wire::open_error::OpenError;
-use crate::wire::open_error::{in_words, not_running, topic_error};
+use crate::wire::open_error::{explain, not_running, topic_error};
 use crate::wire::place::Place;
 use crate::wire::port::subscribers::too_many;
 use crate::wire::shared_memory::reserve;
@@ -102,10 +102,10 @@ impl Hub {
         }
         set_log_level(LogLevel::Fatal);
         place.check_shared_memory(JOIN_BYTES)?;
-        let _joining = place.hold()?;
+        let _joining = place.block_tidy()?;
         let root = place.root.display().to_string();
         let failed =
-            |reason: String| OpenError::Node { root: root.clone(), reason: in_words(&reason) };
+            |reason: String| OpenError::Node { root: root.clone(), reason: explain(&reason) };
         let name = NodeName::new(process).map_err(|e| failed(e.to_string()))?;
         let config = place.transport_config()?;
         let node = NodeBuilder::new()

@@ -225,7 +225,7 @@ mod tests {
     fn tidying_does_not_wait_forever_for_a_process_that_joins() {
         let (folder, place) = place();
         place.create().unwrap();
-        let joining = place.hold().unwrap();
+        let joining = place.block_tidy().unwrap();
         let end = Instant::now();
         assert!(!lock_until(
             &open_lock(&folder.path().join(JOIN_LOCK), USER_ALONE).unwrap(),

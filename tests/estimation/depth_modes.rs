@@ -18,8 +18,8 @@ use semidense::slam::kernel::SimdMode;
 const FRAMES: usize = 150;
 
 /// Shares of the pixels within 1, 2 and 3 σ below which depth is overconfident, and above which it is underconfident.
-const LEAST_COVERAGE: [f64; 3] = [0.55, 0.85, 0.90];
-const MOST_COVERAGE: [f64; 3] = [0.80, 0.98, 1.0];
+const MIN_COVERAGE: [f64; 3] = [0.55, 0.85, 0.90];
+const MAX_COVERAGE: [f64; 3] = [0.80, 0.98, 1.0];
 
 /// The common errors of each keyframe's depth, and the depth errors of all.
 struct Outcome {
@@ -96,7 +96,7 @@ fn assert_coverage(outcomes: &[Outcome], least: [f64; 3], most: [f64; 3]) {
 #[test]
 fn with_exact_poses_depth_has_no_bias_no_tilt_and_keeps_its_relief() {
     let outcomes = [1, 2, 3].map(|seed| room(seed, PoseOrigin::GroundTruth));
-    assert_coverage(&outcomes, LEAST_COVERAGE, MOST_COVERAGE);
+    assert_coverage(&outcomes, MIN_COVERAGE, MAX_COVERAGE);
     let (worst, mean) = worst_and_mean(&outcomes, |m| m.scale);
     let mut figures = mode_figures(&outcomes, 0.001);
     figures.push(Figure::new("bias_worst", worst, 0.0002));
@@ -109,7 +109,7 @@ fn with_estimated_poses_depth_is_hardly_tilted_and_keeps_its_relief() {
     let outcomes = [1, 2, 3].map(|seed| room(seed, PoseOrigin::Tracker));
     hold("rooms-own-poses", &mode_figures(&outcomes, 0.005));
     // Half as many pixels as the rooms for which the line noise was chosen.
-    assert_coverage(&outcomes, LEAST_COVERAGE, [0.86, 0.98, 1.0]);
+    assert_coverage(&outcomes, MIN_COVERAGE, [0.86, 0.98, 1.0]);
 }
 
 #[test]

@@ -189,15 +189,15 @@ proptest! {
             prop_assert_eq!(other.map_revision, u64::from(is_after));
             let mut expected = one.map_from_camera;
             if is_after {
-                expected = new_from_map.place(&expected);
+                expected = new_from_map.transform_pose(&expected);
             }
             let error = distance(&expected, &other.map_from_camera);
             prop_assert!(error < 1e-6 * new_from_map.scale.max(1.0), "map, frame {frame}: {error}");
             // Earlier frames follow their keyframes.
-            let placed = after.place(other.keyframe_id, &other.keyframe_from_camera);
+            let placed = after.frame_pose(other.keyframe_id, &other.keyframe_from_camera);
             if let Some(placed) = placed.filter(|_| one.state == TrackingState::Tracking) {
-                let published = before.place(one.keyframe_id, &one.keyframe_from_camera).unwrap();
-                let error = distance(&new_from_map.place(&published), &placed);
+                let published = before.frame_pose(one.keyframe_id, &one.keyframe_from_camera).unwrap();
+                let error = distance(&new_from_map.transform_pose(&published), &placed);
                 prop_assert!(error < 1e-6 * new_from_map.scale.max(1.0), "result, frame {frame}: {error}");
             }
         }
@@ -221,7 +221,7 @@ fn moved_keyframes_take_their_frames_along() {
     run.apply(&correction);
     let anchored = run.mapper.keyframe().unwrap();
     let last = run.poses[CORRECTED_AT - 1];
-    let again = anchored.world_from_keyframe.place(&last.keyframe_from_camera);
+    let again = anchored.world_from_keyframe.transform_pose(&last.keyframe_from_camera);
     let moved_by = distance(&again, &last.world_from_camera);
     assert!(moved_by < 1e-9, "odometry's place of the camera moved by {moved_by}");
     assert_eq!(anchored.map_from_keyframe, bend(&active.map_from_keyframe));
@@ -233,7 +233,8 @@ fn moved_keyframes_take_their_frames_along() {
     let next = run.poses[CORRECTED_AT];
     let step = distance(&last.world_from_camera, &next.world_from_camera);
     assert!(step < 0.05, "odometry jumps by {step}");
-    let expected = run.mapper.map().place(next.keyframe_id, &next.keyframe_from_camera).unwrap();
+    let expected =
+        run.mapper.map().frame_pose(next.keyframe_id, &next.keyframe_from_camera).unwrap();
     assert!(distance(&expected, &next.map_from_camera) < 1e-9, "the tracker has the new place");
     // A later keyframe is placed according to the corrected map.
     run.show_all(CORRECTED_AT + 1..FRAMES);
@@ -242,7 +243,7 @@ fn moved_keyframes_take_their_frames_along() {
     let made_on = |sequence: u64| run.poses.iter().find(|pose| pose.sequence == sequence);
     let new = &map.keyframes[before.keyframes.len()];
     let pose = made_on(new.sequence).unwrap();
-    let expected = map.place(pose.keyframe_id, &pose.keyframe_from_camera).unwrap();
+    let expected = map.frame_pose(pose.keyframe_id, &pose.keyframe_from_camera).unwrap();
     assert!(distance(&expected, &new.map_from_keyframe.rigid) < 1e-9);
     let in_world = new.world_from_keyframe.rigid;
     assert!(distance(&in_world, &pose.world_from_camera) < 1e-6, "odometry continues");

@@ -21,7 +21,7 @@ use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::keyframe::MapState;
-use semidense::slam::loops::SearchFate;
+use semidense::slam::loops::SearchOutcome;
 use semidense::slam::mapper::recovery::RecoveryParams;
 use semidense::slam::mapper::situation::Situation;
 use semidense::slam::mapper::{Mapper, MapperParams};
@@ -278,7 +278,7 @@ fn frames_from_before_the_start_of_the_map_have_a_pose_in_the_end() {
             Some(again) => (again.keyframe_id, again.keyframe_from_camera),
             None => (e.keyframe_id, e.keyframe_from_camera),
         };
-        let world_from_camera = record.map.place(keyframe_id, &at)?;
+        let world_from_camera = record.map.frame_pose(keyframe_id, &at)?;
         Some(StampedPose { nanos: e.capture_nanos, world_from_camera })
     };
     let all: Vec<StampedPose> = estimates(&record).filter_map(placed).collect();
@@ -356,9 +356,9 @@ fn a_map_with_wrong_poses_is_rejected() {
         let pose = PoseEstimate {
             state: TrackingState::Tracking,
             world_from_camera,
-            keyframe_from_camera: mapper
-                .keyframe()
-                .map_or(SE3::identity(), |k| k.world_from_keyframe.locate(&world_from_camera)),
+            keyframe_from_camera: mapper.keyframe().map_or(SE3::identity(), |k| {
+                k.world_from_keyframe.inverse_transform_pose(&world_from_camera)
+            }),
             keyframe_id,
             epoch,
             proposes_keyframe: index % 15 == 0,
@@ -441,7 +441,7 @@ fn an_epoch_that_sees_a_place_of_an_earlier_one_is_joined_to_it() {
     let searches = record.searches.as_deref().unwrap_or_default();
     let joins: Vec<u64> = searches
         .iter()
-        .filter(|search| search.report.fate == SearchFate::Joined)
+        .filter(|search| search.report.outcome == SearchOutcome::Joined)
         .map(|search| search.sequence)
         .collect();
     println!("joined at {joins:?}, back at {back}");
@@ -451,7 +451,7 @@ fn an_epoch_that_sees_a_place_of_an_earlier_one_is_joined_to_it() {
     assert!(after.iter().all(|e| e.epoch == 0));
     // Frames of both are in one map now; odometry has not moved.
     let placed = |e: &PoseEstimate| {
-        let world_from_camera = record.map.place(e.keyframe_id, &e.keyframe_from_camera)?;
+        let world_from_camera = record.map.frame_pose(e.keyframe_id, &e.keyframe_from_camera)?;
         Some(StampedPose { nanos: e.capture_nanos, world_from_camera })
     };
     let tracked = || estimates(&record).filter(|e| e.state.is_tracked());

@@ -11,8 +11,8 @@ use semidense::slam::evaluation::epochs::evaluate_epochs;
 use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::graph::constraint::Refusal;
-use semidense::slam::loops::{SearchFate, SearchReport};
-use semidense::slam::map::{ConfirmedPoint, PlacedFrame};
+use semidense::slam::loops::{SearchOutcome, SearchReport};
+use semidense::slam::map::{ConfirmedPoint, RealignedFrame};
 use semidense::slam::mapper::consistency::Contradiction;
 use semidense::slam::pose::{DegradedReason, LostReason, TrackingState};
 use semidense::slam::window::Adjustment;
@@ -24,7 +24,11 @@ fn frames_aligned_afterwards_count_only_if_the_map_was_tracked_on() {
         let mut record = record.clone();
         for sequence in 0..3 {
             let keyframe_from_camera = SE3::identity();
-            record.map.place_frame(&PlacedFrame { sequence, keyframe_id: 0, keyframe_from_camera });
+            record.map.store_frame_pose(&RealignedFrame {
+                sequence,
+                keyframe_id: 0,
+                keyframe_from_camera,
+            });
         }
         record
     };
@@ -169,7 +173,7 @@ fn searches_for_loops_are_in_summary_and_report() {
             other: Some(0),
             likeness: 20.0,
             compared: 1,
-            fate,
+            outcome: fate,
             measured: None,
         },
     };
@@ -179,12 +183,12 @@ fn searches_for_loops_are_in_summary_and_report() {
     let (_, report) = written(folder.path(), &record);
     assert!(!report.contains("<h2>Loops</h2>"), "none was looked for");
     let fates = [
-        SearchFate::Proposed,
-        SearchFate::Closed,
-        SearchFate::Refused(Refusal::FewInliers),
-        SearchFate::Refused(Refusal::NotReciprocal(20.0)),
-        SearchFate::Refused(Refusal::NotReciprocal(30.0)),
-        SearchFate::AgainstDrift(99.0),
+        SearchOutcome::Proposed,
+        SearchOutcome::Closed,
+        SearchOutcome::Refused(Refusal::FewInliers),
+        SearchOutcome::Refused(Refusal::NotReciprocal(20.0)),
+        SearchOutcome::Refused(Refusal::NotReciprocal(30.0)),
+        SearchOutcome::AgainstDrift(99.0),
     ];
     record.searches = Some(fates.map(|fate| search(1, fate)).to_vec());
     let (summary, report) = written(tempfile::tempdir().unwrap().path(), &record);
@@ -267,7 +271,11 @@ fn trajectories_mark_where_another_epoch_begins() {
     record.map.keyframes[1].epoch = 1;
     for sequence in 18..20 {
         let keyframe_from_camera = SE3::identity();
-        record.map.place_frame(&PlacedFrame { sequence, keyframe_id: 1, keyframe_from_camera });
+        record.map.store_frame_pose(&RealignedFrame {
+            sequence,
+            keyframe_id: 1,
+            keyframe_from_camera,
+        });
     }
     let part = |epoch: &str, poses: usize| (epoch.to_owned(), poses);
     let parts = |record: &RunRecord| {
@@ -321,7 +329,11 @@ fn frames_with_a_pose_assigned_afterwards_are_not_lost_and_their_epoch_counts() 
     record.map.keyframes[1].epoch = 1;
     for sequence in 50..60 {
         let keyframe_from_camera = SE3::identity();
-        record.map.place_frame(&PlacedFrame { sequence, keyframe_id: 1, keyframe_from_camera });
+        record.map.store_frame_pose(&RealignedFrame {
+            sequence,
+            keyframe_id: 1,
+            keyframe_from_camera,
+        });
     }
     let folder = tempfile::tempdir().unwrap();
     let (summary, report) = written(folder.path(), &record);

@@ -20,7 +20,7 @@ use crate::waves::{CAMERA, header, keyframe};
 const REPORTS: usize = 40;
 /// Upper limit for the frames between two received reports. With every frame of a flood others are dropped, which is
 /// reported within 10 ms; a frame for which every view is searched takes some of them.
-const MOST_FRAMES_BETWEEN: u64 = 60;
+const MAX_FRAMES_BETWEEN: u64 = 60;
 /// Far above any expected duration: it ends a test that hangs.
 const PATIENCE: Duration = Duration::from_secs(60);
 
@@ -87,7 +87,7 @@ fn a_tracker_that_is_always_behind_reports_and_ends() {
     flooding.join().unwrap();
     tracking.join().unwrap();
     assert!(told.len() >= REPORTS, "it told {told:?} in all");
-    let is_prompt = |pair: &[u64]| (pair[0] + 1..=pair[0] + MOST_FRAMES_BETWEEN).contains(&pair[1]);
+    let is_prompt = |pair: &[u64]| (pair[0] + 1..=pair[0] + MAX_FRAMES_BETWEEN).contains(&pair[1]);
     assert!(told.windows(2).all(is_prompt), "frames at its reports: {told:?}");
     assert!(has_ended, "the signal to end was not heard as long as frames came");
 }

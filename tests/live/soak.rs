@@ -43,7 +43,7 @@ const HASTY: Duration = Duration::from_secs(2);
 /// Files are counted once unchanged for this long.
 const SETTLED: Duration = Duration::from_secs(2);
 /// Keyframes that a mapper keeps for its successor, plus one while it writes.
-const MOST_KEPT_KEYFRAMES: usize = 21;
+const MAX_KEPT_KEYFRAMES: usize = 21;
 /// Factor on the initial memory of a process that it may reach: pages of other code, a fuller map.
 const MEMORY_SLACK: f64 = 1.5;
 
@@ -158,7 +158,7 @@ fn files(rig: &Rig) -> BTreeMap<String, usize> {
             Err(_) => *counts.entry(kind).or_default() += 1,
         }
     }
-    assert!(keyframes <= 2 * MOST_KEPT_KEYFRAMES, "{keyframes} keyframes are kept of two rigs");
+    assert!(keyframes <= 2 * MAX_KEPT_KEYFRAMES, "{keyframes} keyframes are kept of two rigs");
     counts
 }
 

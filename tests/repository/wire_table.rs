@@ -73,7 +73,9 @@ fn length_of(expression: &syn::Expr) -> usize {
                 "TEXT_BYTES" => TEXT_BYTES,
                 "PATH_BYTES" => PATH_BYTES,
                 "HISTOGRAM_BUCKETS" => HISTOGRAM_BUCKETS,
-                "PLACE_ENTRIES" => semidense::slam::place_covariance::PLACE_ENTRIES,
+                "KEYFRAME_POSE_ENTRIES" => {
+                    semidense::slam::keyframe_pose_covariance::KEYFRAME_POSE_ENTRIES
+                }
                 other => panic!("the length {other} is not known to this test"),
             }
         }

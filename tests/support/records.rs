@@ -67,7 +67,7 @@ pub fn pose(i: usize, state: TrackingState, keyframe_id: u64) -> RecordedPose {
         state,
         world_from_camera,
         map_from_camera: world_from_camera,
-        keyframe_from_camera: world_from_keyframe(0).locate(&world_from_camera),
+        keyframe_from_camera: world_from_keyframe(0).inverse_transform_pose(&world_from_camera),
         ..PoseEstimate::unknown_at(i as u64, nanos(i))
     };
     RecordedPose {

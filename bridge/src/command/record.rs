@@ -55,9 +55,9 @@ pub struct RecordArguments {
 /// Parses a positive number of seconds.
 fn parse_seconds(text: &str) -> Result<Duration, String> {
     /// A year: anything longer is a mistake.
-    const MOST: f64 = 366.0 * 86_400.0;
+    const MAX_SECS: f64 = 366.0 * 86_400.0;
     let wanted = "needs a number of seconds above 0";
-    number_within(text, f64::MIN_POSITIVE..=MOST, wanted).map(Duration::from_secs_f64)
+    number_within(text, f64::MIN_POSITIVE..=MAX_SECS, wanted).map(Duration::from_secs_f64)
 }
 
 /// Records until the instance ends, a signal arrives or the time is over.

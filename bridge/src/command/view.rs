@@ -100,11 +100,11 @@ pub fn run(common: &CommonArguments, arguments: &ViewArguments) -> CommandResult
         None => live(common, arguments)?,
     };
     let server = Server::open(arguments.listen, guard, shown)?;
-    say(&server, arguments, token.as_deref());
+    print_addresses(&server, arguments, token.as_deref());
     server.start()?;
     if let Shown::Live { feed, scene, .. } = &server.shown {
         let (listener, shown) = (feed.listen(USUAL_DEPTH), Arc::clone(scene));
-        start("scene", move || keep_up(&listener, &shown))?;
+        start("scene", move || update_scene(&listener, &shown))?;
         let (server, scene, place) = (Arc::clone(&server), Arc::clone(scene), common.place()?);
         start("history", move || follow(&place, &scene, &server.is_over))?;
     }
@@ -134,7 +134,7 @@ fn live(
 }
 
 /// Updates the scene from the feed until that ends.
-fn keep_up(listener: &Listener, scene: &Scene) {
+fn update_scene(listener: &Listener, scene: &Scene) {
     while let Ok(event) = listener.next(LOOK_PERIOD) {
         event.into_iter().for_each(|event| scene.take(event));
     }
@@ -167,14 +167,14 @@ fn own_names() -> Vec<String> {
 /// Address of this machine in the network of its default route.
 fn own_address() -> Option<IpAddr> {
     /// From a documentation network (RFC 5737): connecting a datagram socket selects a route and sends nothing.
-    const ELSEWHERE: (Ipv4Addr, u16) = (Ipv4Addr::new(192, 0, 2, 1), 9);
+    const ROUTE_PROBE_ADDRESS: (Ipv4Addr, u16) = (Ipv4Addr::new(192, 0, 2, 1), 9);
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).ok()?;
-    socket.connect(ELSEWHERE).ok()?;
+    socket.connect(ROUTE_PROBE_ADDRESS).ok()?;
     Some(socket.local_addr().ok()?.ip())
 }
 
 /// Prints the addresses to open to standard output, where a script may read them.
-fn say(server: &Server, arguments: &ViewArguments, token: Option<&str>) {
+fn print_addresses(server: &Server, arguments: &ViewArguments, token: Option<&str>) {
     let address = server.address;
     let shown: Vec<String> = match address.ip() {
         // An unspecified address covers all: print a name that others can open, and a number in case it does not

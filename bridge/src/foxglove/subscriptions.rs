@@ -1,7 +1,7 @@
 //! Channels to which a client is subscribed.
 
 /// Upper limit for the subscriptions of a client: several for each channel.
-const MOST: usize = 64;
+const MAX_SUBSCRIPTIONS: usize = 64;
 
 /// The subscriptions of a client, which chooses their ids.
 #[derive(Debug)]
@@ -26,8 +26,8 @@ impl Subscriptions {
         if self.all.iter().any(|(id, _)| *id == subscription) {
             return Err(format!("subscription {subscription} already exists"));
         }
-        if self.all.len() >= MOST {
-            return Err(format!("a client can have at most {MOST} subscriptions"));
+        if self.all.len() >= MAX_SUBSCRIPTIONS {
+            return Err(format!("a client can have at most {MAX_SUBSCRIPTIONS} subscriptions"));
         }
         self.all.push((subscription, channel));
         Ok(channel)

@@ -56,7 +56,7 @@ fn row_major(covariance: &Matrix6<f64>) -> [f64; 36] {
 }
 
 /// Rotates both three-vectors of a six-vector by `rotation`.
-fn both_turned(rotation: &Matrix3<f64>) -> Matrix6<f64> {
+fn rotate_both(rotation: &Matrix3<f64>) -> Matrix6<f64> {
     let mut both = Matrix6::zeros();
     both.fixed_view_mut::<3, 3>(0, 0).copy_from(rotation);
     both.fixed_view_mut::<3, 3>(3, 3).copy_from(rotation);
@@ -73,7 +73,7 @@ pub fn place_covariance(position: &Vector3<f64>, left_increment: &[f64; 21]) -> 
 
 /// The same in `map`, from the left increment of `map_from_camera`.
 pub fn map_covariance(map_from_camera: &SE3, left_increment: &[f64; 21]) -> [f64; 36] {
-    let turned = both_turned(&ros_from_world().rotation_matrix());
+    let turned = rotate_both(&ros_from_world().rotation_matrix());
     let covariance = place_covariance(&map_from_camera.translation, left_increment);
     row_major(&(turned * covariance * turned.transpose()))
 }
@@ -89,7 +89,7 @@ pub fn odometry_covariance(
     let ros_from_camera = (ros_from_world() * *world_from_camera).rotation_matrix();
     let scale = Vector6::new(unit, unit, unit, 1.0, 1.0, 1.0);
     // The sign of the increment does not affect its covariance.
-    let jacobian = both_turned(&ros_from_camera) * Matrix6::from_diagonal(&scale);
+    let jacobian = rotate_both(&ros_from_camera) * Matrix6::from_diagonal(&scale);
     row_major(&(jacobian * matrix(left_increment) * jacobian.transpose()))
 }
 

@@ -165,7 +165,7 @@ impl Publishers {
                 self.publish(message);
             }
             if looked.is_due(READERS_PERIOD) {
-                self.look_for_readers();
+                self.count_readers();
             }
             if reported.is_due(REPORT_PERIOD) {
                 let report = self.report();
@@ -201,7 +201,7 @@ impl Publishers {
     }
 
     /// Counts the readers of costly messages, and reports those that receive nothing.
-    fn look_for_readers(&mut self) {
+    fn count_readers(&mut self) {
         let name_of = |topic: RosTopic| dds_name(&topic.name_in(&self.params.namespace));
         let (Ok(image), Ok(info), Ok(points)) =
             (name_of(topic::IMAGE), name_of(topic::CAMERA_INFO), name_of(topic::POINTS))

@@ -24,7 +24,7 @@ const MAX_HEADER_LINES: usize = 256;
 /// Upper limit for the bytes of one point of a PLY: ours has 40.
 const MAX_POINT_BYTES: usize = 1024;
 /// Points whose normals are used to find the up direction.
-const MOST_NORMALS: usize = 20_000;
+const MAX_NORMALS: usize = 20_000;
 /// Points read at a time.
 const CHUNK: usize = 4096;
 /// The camera if the folder does not specify one: 640 by 480, 62° wide.
@@ -64,7 +64,7 @@ pub fn read_run(folder: &Path, max_points: usize) -> Result<Vec<u8>, FinishedErr
     let points = read_points(&folder.join("map.ply"), max_points)?;
     let intrinsics = camera(&read_summary(folder)).unwrap_or(USUAL_CAMERA);
     // Without normals, the up direction follows from the cameras alone.
-    let surface = read_surface(&folder.join("map.ply"), MOST_NORMALS).unwrap_or_default();
+    let surface = read_surface(&folder.join("map.ply"), MAX_NORMALS).unwrap_or_default();
     let up = up_direction(path.iter(), surface.iter().map(|point| point.normal));
     Ok(pack(&SceneInput {
         points: &points,

@@ -28,7 +28,7 @@ const LONGEST_ANSWER: Duration = Duration::from_secs(2);
 
 /// Requests missing keyframes until `is_over`.
 pub fn follow(place: &Place, scene: &Arc<Scene>, is_over: &AtomicBool) {
-    let mut asking: Option<(u64, Asking)> = None;
+    let mut asking: Option<(u64, KeyframeRequester)> = None;
     while !is_over.load(Ordering::Relaxed) {
         let (run, is_joined, wanted, is_known) = {
             let state = scene.lock();
@@ -46,7 +46,7 @@ pub fn follow(place: &Place, scene: &Arc<Scene>, is_over: &AtomicBool) {
             continue;
         };
         if asking.is_none() {
-            match Asking::open(place) {
+            match KeyframeRequester::open(place) {
                 Ok(opened) => {
                     asking = Some((run, opened));
                     note(scene, "");
@@ -66,7 +66,7 @@ pub fn follow(place: &Place, scene: &Arc<Scene>, is_over: &AtomicBool) {
         match ports.ask(keyframe_id) {
             Ok(Some(keyframe)) if scene.lock().run == run => {
                 scene.lock().keep(&keyframe);
-                scene.tell();
+                scene.wake_waiting();
             }
             Ok(_) => {}
             Err(CommandError::Refused(_)) => scene.lock().give_up(keyframe_id),
@@ -89,14 +89,14 @@ fn note(scene: &Scene, text: &str) {
 }
 
 /// The ports of a request; the hub is dropped last.
-struct Asking {
+struct KeyframeRequester {
     depths: Subscriber<DepthPoint, KeyframeHeader>,
     images: Subscriber<u8, KeyframeImageHeader>,
     commands: CommandClient,
     _hub: Hub,
 }
 
-impl Asking {
+impl KeyframeRequester {
     fn open(place: &Place) -> Result<Self, OpenError> {
         let hub = Hub::join(place, "view-history", Access::Observer)?;
         Ok(Self {

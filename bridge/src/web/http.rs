@@ -18,7 +18,7 @@ const LONGEST_HEAD: Duration = Duration::from_secs(5);
 /// Upper limit for the wait, after the answer, until the other end closes.
 const LONGEST_CLOSE: Duration = Duration::from_secs(1);
 /// Upper limit for the bytes read during that wait: a refused request may still be arriving.
-const MOST_LEFT_BYTES: usize = 256 << 10;
+const MAX_LEFTOVER_BYTES: usize = 256 << 10;
 
 /// The head of a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -202,7 +202,7 @@ impl<'a> Answer<'a> {
 fn close(stream: &mut TcpStream) -> io::Result<()> {
     stream.shutdown(Shutdown::Write)?;
     let end = Instant::now() + LONGEST_CLOSE;
-    let mut left = MOST_LEFT_BYTES;
+    let mut left = MAX_LEFTOVER_BYTES;
     let mut chunk = [0; 4096];
     while left > 0 && Instant::now() < end {
         stream.set_read_timeout(Some(LONGEST_CLOSE))?;

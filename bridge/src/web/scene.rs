@@ -266,7 +266,7 @@ impl Scene {
     }
 
     /// Wakes waiting pages after a change from outside.
-    pub fn tell(&self) {
+    pub fn wake_waiting(&self) {
         self.lock().version += 1;
         self.changed.notify_all();
     }
@@ -281,7 +281,7 @@ impl Scene {
 
     /// Number of open pages.
     pub fn pages(&self) -> usize {
-        self.pages.taken()
+        self.pages.num_taken()
     }
 
     /// Counts a page while it is open and gives it the active keyframe at once. `None` if `most` are open.

@@ -20,7 +20,7 @@ impl Seats {
     }
 
     /// Number of seats in use.
-    pub fn taken(&self) -> usize {
+    pub fn num_taken(&self) -> usize {
         self.0.load(Ordering::Relaxed)
     }
 }

@@ -51,7 +51,7 @@ pub struct StreamOptions {
 /// A message from a page.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
-struct Said {
+struct PageMessage {
     /// Large messages received since its last message.
     ack: usize,
     /// Whether it shows images.
@@ -99,7 +99,7 @@ fn listen(socket: &mut WebSocket<TcpStream>, sent: &mut Sent) -> Result<bool, Er
         match socket.read() {
             Ok(Message::Text(said)) => {
                 // An unknown message is treated as empty.
-                let said: Said = serde_json::from_str(said.as_str()).unwrap_or_default();
+                let said: PageMessage = serde_json::from_str(said.as_str()).unwrap_or_default();
                 sent.unanswered = sent.unanswered.saturating_sub(said.ack);
                 sent.shows_frames = said.frames.unwrap_or(sent.shows_frames);
             }

@@ -46,7 +46,7 @@ pub struct ClockOffset {
 
 impl ClockOffset {
     /// Sets CLOCK_REALTIME − CLOCK_MONOTONIC of both machines.
-    pub fn tell_realtime(&mut self, remote_nanos: i64, local_nanos: i64) {
+    pub fn set_realtime(&mut self, remote_nanos: i64, local_nanos: i64) {
         self.by_realtime_nanos = remote_nanos.saturating_sub(local_nanos);
     }
 
@@ -113,7 +113,7 @@ mod tests {
     #[test]
     fn before_the_first_answer_the_realtime_clocks_count() {
         let mut offset = ClockOffset::default();
-        offset.tell_realtime(1_000, 5_000);
+        offset.set_realtime(1_000, 5_000);
         assert_eq!((offset.local_nanos(10_000), offset.uncertainty_nanos()), (6_000, None));
     }
 

@@ -205,7 +205,7 @@ fn config(endpoints: &Endpoints) -> Result<Config, ZenohError> {
 fn read_password(path: &Path) -> Result<(String, String), ZenohError> {
     use std::os::unix::fs::PermissionsExt;
     /// Permissions of the group and of all others.
-    const OF_OTHERS: u32 = 0o077;
+    const GROUP_AND_OTHERS: u32 = 0o077;
     let wrong = |reason: &str| {
         let path = path.display();
         ZenohError::Link(format!(
@@ -213,7 +213,7 @@ fn read_password(path: &Path) -> Result<(String, String), ZenohError> {
         ))
     };
     let found = std::fs::metadata(path).map_err(|error| wrong(&error.to_string()))?;
-    if found.permissions().mode() & OF_OTHERS != 0 {
+    if found.permissions().mode() & GROUP_AND_OTHERS != 0 {
         return Err(wrong("others can read it"));
     }
     let text = std::fs::read_to_string(path).map_err(|error| wrong(&error.to_string()))?;

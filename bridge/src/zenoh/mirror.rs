@@ -123,7 +123,7 @@ impl Mirror {
     }
 
     /// Reports the cause of a silence once a second, as stale health. A finished process stays finished.
-    pub fn tell_silence(&mut self, cause: &str) -> Result<(), ZenohError> {
+    pub fn report_silence(&mut self, cause: &str) -> Result<(), ZenohError> {
         let now = now_nanos();
         for reported in &mut self.health {
             let since = now.saturating_sub(reported.told_nanos);

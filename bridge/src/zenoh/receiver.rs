@@ -27,7 +27,7 @@ use crate::zenoh::shared::Shared;
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
 
 /// Time between two log lines.
-const TELL_PERIOD: Duration = Duration::from_secs(10);
+const LOG_PERIOD: Duration = Duration::from_secs(10);
 
 /// Receives the instance `from` of the robot until a signal arrives, and publishes it as the instance at
 /// `place`. Waits for a robot that is not reachable yet.
@@ -52,7 +52,7 @@ pub fn receive(
             named("unpack").spawn_scoped(scope, move || shared.unpack_large()).and_then(|_| {
                 named("ask").spawn_scoped(scope, move || poll(network, from, shared, &stop))
             });
-        let silence = |now| shared.remote().silence(from, &endpoints.to_string(), now);
+        let silence = |now| shared.remote().silence_reason(from, &endpoints.to_string(), now);
         let outcome = started
             .map_err(ZenohError::from)
             .and_then(|_| publish(&mut mirror, shared, silence, &woken, shutdown));
@@ -101,17 +101,17 @@ fn publish(
             }
         }
         if let Some(cause) = silence(Instant::now()) {
-            mirror.tell_silence(&cause)?;
+            mirror.report_silence(&cause)?;
         }
-        if told.is_due(TELL_PERIOD) {
-            tell(shared);
+        if told.is_due(LOG_PERIOD) {
+            log_missed(shared);
         }
     }
     Ok(())
 }
 
 /// Logs what was lost.
-fn tell(shared: &Shared) {
+fn log_missed(shared: &Shared) {
     let remote = shared.remote();
     let lost: Vec<String> = Kind::ALL
         .into_iter()

@@ -10,7 +10,7 @@ use crate::zenoh::kind::Kind;
 use crate::zenoh::outlet::{Presence, realtime_offset_nanos};
 
 /// A sender that is silent for longer gives way to another program with its name: presence is queried once a second.
-const GIVES_WAY: Duration = Duration::from_millis(1500);
+const TAKEOVER_AFTER: Duration = Duration::from_millis(1500);
 /// Silence after which health reports the link as down: processes report once a second.
 const LONGEST_SILENCE: Duration = Duration::from_secs(3);
 
@@ -36,7 +36,7 @@ pub struct Remote {
 impl Remote {
     /// Whether a message is to be used: from the current sender and run, and new.
     pub fn admit(&mut self, envelope: &Envelope, kind: Kind, now: Instant) -> bool {
-        if !self.hear(envelope, now) || envelope.run < self.run {
+        if !self.is_from_sender(envelope, now) || envelope.run < self.run {
             return false;
         }
         self.run = envelope.run;
@@ -59,7 +59,7 @@ impl Remote {
         clock: ClockAnswer,
         now: Instant,
     ) -> Vec<Kind> {
-        if !self.hear(envelope, now) {
+        if !self.is_from_sender(envelope, now) {
             return Vec::new();
         }
         self.clock.take(clock);
@@ -70,7 +70,7 @@ impl Remote {
     }
 
     /// Records a message of another wire version.
-    pub fn hear_foreign(&mut self, version: u32, now: Instant) {
+    pub fn note_foreign_version(&mut self, version: u32, now: Instant) {
         if self.foreign.is_none_or(|(known, _)| known != version) {
             tracing::warn!(
                 "the robot uses wire version {version}, this program {WIRE_VERSION}: install the same version of semidense-bridge on both"
@@ -80,7 +80,7 @@ impl Remote {
     }
 
     /// Why the state is outdated; `None` while the sender and its instance are running.
-    pub fn silence(&self, instance: &str, endpoints: &str, now: Instant) -> Option<String> {
+    pub fn silence_reason(&self, instance: &str, endpoints: &str, now: Instant) -> Option<String> {
         let is_recent = |heard: &Instant| now.saturating_duration_since(*heard) <= LONGEST_SILENCE;
         if self.heard.as_ref().is_none_or(|heard| !is_recent(heard)) {
             let foreign = self.foreign.as_ref().filter(|(_, heard)| is_recent(heard));
@@ -109,10 +109,11 @@ impl Remote {
     }
 
     /// Whether the envelope is from the current sender: the first one heard, or its successor once it has gone.
-    fn hear(&mut self, envelope: &Envelope, now: Instant) -> bool {
+    fn is_from_sender(&mut self, envelope: &Envelope, now: Instant) -> bool {
         if self.sender != Some(envelope.sender) {
-            let is_alive =
-                self.heard.is_some_and(|heard| now.saturating_duration_since(heard) < GIVES_WAY);
+            let is_alive = self
+                .heard
+                .is_some_and(|heard| now.saturating_duration_since(heard) < TAKEOVER_AFTER);
             if self.sender.is_some() && is_alive {
                 if self.rival.is_none() {
                     tracing::warn!("two programs send under the same name; only one is used");
@@ -123,7 +124,7 @@ impl Remote {
             self.begin(envelope.sender);
         }
         self.heard = Some(now);
-        self.clock.tell_realtime(envelope.realtime_offset_nanos, realtime_offset_nanos());
+        self.clock.set_realtime(envelope.realtime_offset_nanos, realtime_offset_nanos());
         true
     }
 
@@ -162,17 +163,17 @@ mod tests {
         let (mut remote, now) = (Remote::default(), Instant::now());
         assert!(remote.admit(&envelope(1, 3, 50), Kind::Pose, now));
         assert!(!remote.admit(&envelope(2, 1, 1), Kind::Pose, now));
-        assert!(remote.silence("rig", "x", now).unwrap().contains("two programs"));
-        let later = now + GIVES_WAY;
+        assert!(remote.silence_reason("rig", "x", now).unwrap().contains("two programs"));
+        let later = now + TAKEOVER_AFTER;
         assert!(remote.admit(&envelope(2, 1, 1), Kind::Pose, later));
     }
 
     #[test]
     fn silence_is_reported_with_its_cause() {
         let (mut remote, now) = (Remote::default(), Instant::now());
-        let cause = |remote: &Remote, now| remote.silence("rig", "tcp/robot:7447", now);
+        let cause = |remote: &Remote, now| remote.silence_reason("rig", "tcp/robot:7447", now);
         assert!(cause(&remote, now).unwrap().contains("tcp/robot:7447"));
-        remote.hear_foreign(WIRE_VERSION + 1, now);
+        remote.note_foreign_version(WIRE_VERSION + 1, now);
         let both = cause(&remote, now).unwrap();
         assert!(both.contains(&format!("version {}", WIRE_VERSION + 1)), "{both}");
         let mut presence = Presence { is_joined: 1, newest: [0; Kind::COUNT] };

@@ -133,7 +133,7 @@ impl Reader<'_> {
             if let Some(keyframe) = self.keyframes.due(Instant::now()) {
                 self.put(Kind::Keyframe, Item::Keyframe(keyframe));
             }
-            traffic.tell(self.outlet, || self.dropped(), session.refused());
+            traffic.log_if_due(self.outlet, || self.dropped(), session.refused());
         }
         Ok(())
     }

@@ -70,7 +70,7 @@ impl Shared {
         match open(bytes) {
             Ok(opened) if opened.kind == kind => return Some(opened),
             Err(EnvelopeError::Version { found }) => {
-                self.remote().hear_foreign(found, Instant::now());
+                self.remote().note_foreign_version(found, Instant::now());
             }
             _ => self.remote().refused += 1,
         }

@@ -26,7 +26,7 @@ impl Default for Traffic {
 
 impl Traffic {
     /// Logs the traffic since the last line, if that is due.
-    pub fn tell(
+    pub fn log_if_due(
         &mut self,
         outlet: &Outlet,
         dropped: impl Fn() -> [(&'static str, u64); 5],

@@ -5,7 +5,7 @@ use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::keyframe::DepthPoint;
 use semidense::wire::conversion::{
     MessageError, check_points, frame_from_message, keyframe_pose_from_message,
-    map_state_from_code, mode_covariance_from_message, place_covariance_from_message,
+    map_state_from_code, mode_covariance_from_message, pose_covariance_from_message,
     pose_from_message, similarity_from_message,
 };
 use semidense::wire::message::{
@@ -123,7 +123,7 @@ fn check_keyframe(header: &KeyframeHeader) -> Result<Intrinsics, MessageError> {
     similarity_from_message(&header.world_from_keyframe, "world_from_keyframe")?;
     similarity_from_message(&header.map_from_keyframe, "map_from_keyframe")?;
     mode_covariance_from_message(&header.mode_covariance)?;
-    place_covariance_from_message(&header.place_covariance)?;
+    pose_covariance_from_message(&header.place_covariance)?;
     Ok(intrinsics)
 }
 

@@ -8,7 +8,7 @@ use crate::capture::rig::{LensModel, Rig, RigFile};
 
 /// Maximum number of non-zero lens coefficients: those of the rational model after the eighth describe a thin prism and
 /// a tilt, which no rig has.
-const MOST_COEFFICIENTS: usize = 8;
+const MAX_COEFFICIENTS: usize = 8;
 
 /// Returns the rig of the camera of the images on `topic`, or the reason why there is none.
 pub fn rig_of(camera: &CameraInfo, topic: &str, path: &Path) -> Result<Rig, String> {
@@ -43,8 +43,8 @@ fn coefficients(camera: &CameraInfo) -> Result<Vec<f64>, String> {
         ("plumb_bob", 0 | 4 | 5) | ("equidistant" | "fisheye", 4) => d,
         ("equidistant" | "fisheye", 5) if d[4] == 0.0 => &d[..4],
         ("rational_polynomial", 8) => d,
-        ("rational_polynomial", 12 | 14) if d[MOST_COEFFICIENTS..].iter().all(|k| *k == 0.0) => {
-            &d[..MOST_COEFFICIENTS]
+        ("rational_polynomial", 12 | 14) if d[MAX_COEFFICIENTS..].iter().all(|k| *k == 0.0) => {
+            &d[..MAX_COEFFICIENTS]
         }
         // Drivers without a calibration leave the model empty.
         ("", _) if d.iter().all(|k| *k == 0.0) => &[],

@@ -50,7 +50,7 @@ fn play(bag: &mut Bag) -> (Vec<(u64, u8)>, Vec<String>) {
         match bag.next_into(&mut pixels) {
             Ok(Some(stamp)) => frames.push((stamp.sequence, pixels[PIXELS / 2 + 16])),
             Ok(None) => return (frames, errors),
-            Err(error) if error.is_passing() => errors.push(error.to_string()),
+            Err(error) if error.is_transient() => errors.push(error.to_string()),
             Err(error) => panic!("{error}"),
         }
     }

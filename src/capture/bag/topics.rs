@@ -75,12 +75,12 @@ fn base_topic(topic: &str) -> &str {
 /// Topics as a list for an error.
 pub fn listed<'a>(topics: impl Iterator<Item = &'a str>) -> String {
     /// A longer list would not be read.
-    const MOST: usize = 20;
+    const MAX_LISTED: usize = 20;
     let mut names: Vec<&str> = topics.collect();
     names.sort_unstable();
     names.dedup();
-    let more = names.len().saturating_sub(MOST);
-    names.truncate(MOST);
+    let more = names.len().saturating_sub(MAX_LISTED);
+    names.truncate(MAX_LISTED);
     match (names.is_empty(), more) {
         (true, _) => "none".to_owned(),
         (_, 0) => names.join(", "),

@@ -41,7 +41,7 @@ impl Feed {
             Self::Program(program) => program.connect(now)?,
         };
         if let Some(stream) = &stream {
-            let refused = |error| Absence::passing(format!("its stream was refused ({error})"));
+            let refused = |error| Absence::transient(format!("its stream was refused ({error})"));
             stream.set_nonblocking(true).map_err(refused)?;
         }
         Ok(stream)
@@ -115,7 +115,7 @@ impl Listener {
     fn connect(&mut self, now: i64) -> Result<Option<UnixStream>, Absence> {
         let Some(listener) = &self.listener else {
             if now < self.pause.retry_nanos {
-                return Err(Absence::passing(self.last.clone()));
+                return Err(Absence::transient(self.last.clone()));
             }
             let bound = bind(&self.path).inspect_err(|absence| {
                 self.pause.begin(now);
@@ -129,7 +129,7 @@ impl Listener {
             Err(error) if error.kind() == ErrorKind::WouldBlock => Ok(None),
             Err(error) => {
                 let reason = format!("{}: no sender can connect ({error})", self.path.display());
-                Err(Absence::passing(reason))
+                Err(Absence::transient(reason))
             }
         }
     }
@@ -153,7 +153,7 @@ fn bind(path: &Path) -> Result<UnixListener, Absence> {
         Err(error) if error.kind() == ErrorKind::AddrInUse && is_socket() => {
             if UnixStream::connect(path).is_ok() {
                 let reason = "another process receives frames there; stop it or name another path";
-                return Err(Absence::passing(at(reason.to_owned())));
+                return Err(Absence::transient(at(reason.to_owned())));
             }
             std::fs::remove_file(path).and_then(|()| UnixListener::bind(path))
         }

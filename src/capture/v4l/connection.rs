@@ -11,7 +11,7 @@ use rustix::io::Errno;
 
 use super::controls::{self, Exposure};
 use super::kernel::FLAG_ERROR;
-use super::negotiation::{Grant, NegotiationError, Wish, negotiate, rate_differs};
+use super::negotiation::{Grant, NegotiationError, StreamRequest, negotiate, rate_differs};
 use super::params::CameraParams;
 use super::stamps::{FrameNumbers, MAX_REFUSED_IN_A_ROW, taken};
 use super::video_device::{Filled, OpenFailure, VideoDevice, VideoSystem};
@@ -30,7 +30,7 @@ const MAX_NOTICES: usize = 16;
 
 /// A frame held for its reader.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Held {
+pub struct HeldFrame {
     /// Its buffer.
     pub filled: Filled,
     /// Its stamp.
@@ -49,7 +49,7 @@ struct Stream<D> {
     exposure: Exposure,
     exposure_nanos: i64,
     lock_is_due: bool,
-    held: Option<Held>,
+    held: Option<HeldFrame>,
 }
 
 enum State<D> {
@@ -62,7 +62,7 @@ pub struct Camera<S: VideoSystem> {
     system: S,
     name: String,
     params: CameraParams,
-    wish: Wish,
+    requested: StreamRequest,
     state: State<S::Device>,
     pause_nanos: i64,
     numbers: FrameNumbers,
@@ -77,12 +77,12 @@ pub struct Camera<S: VideoSystem> {
 
 impl<S: VideoSystem> Camera<S> {
     /// Creates a camera that is not open yet.
-    pub fn new(system: S, name: String, params: CameraParams, wish: Wish) -> Self {
+    pub fn new(system: S, name: String, params: CameraParams, requested: StreamRequest) -> Self {
         Self {
             system,
             name,
             params,
-            wish,
+            requested,
             state: State::Absent { retry_nanos: i64::MIN, reason: "not opened yet".to_owned() },
             pause_nanos: FIRST_PAUSE_NANOS,
             numbers: FrameNumbers::default(),
@@ -123,7 +123,7 @@ impl<S: VideoSystem> Camera<S> {
                 }
                 self.open().map(|()| Arrival::Nothing)
             }
-            State::Streaming(_) => self.look(wake, millis),
+            State::Streaming(_) => self.poll(wake, millis),
         };
         match outcome {
             Ok(arrival) => Ok(arrival),
@@ -157,8 +157,8 @@ impl<S: VideoSystem> Camera<S> {
         let (path, mut device) =
             self.system.open(&self.name).map_err(|failure| open_failure(&self.name, failure))?;
         let at = |reason: String| format!("{}: {reason}", path.display());
-        let refused = |error: Errno| Absence::passing(at(refusal(error, &path.display())));
-        let grant = negotiate(&mut device, &self.wish).map_err(|error| match error {
+        let refused = |error: Errno| Absence::transient(at(refusal(error, &path.display())));
+        let grant = negotiate(&mut device, &self.requested).map_err(|error| match error {
             NegotiationError::Device(error) => refused(error),
             error @ NegotiationError::Size { .. } => Absence {
                 reason: at(format!("{error}; name a rig of a size that it offers with --rig")),
@@ -166,9 +166,9 @@ impl<S: VideoSystem> Camera<S> {
             },
             error => Absence { reason: at(error.to_string()), passes: false },
         })?;
-        if rate_differs(self.wish.rate_hz, grant.rate_hz) {
+        if rate_differs(self.requested.rate_hz, grant.rate_hz) {
             let (wanted, granted) =
-                (self.wish.rate_hz.unwrap_or(0.0), grant.rate_hz.unwrap_or(0.0));
+                (self.requested.rate_hz.unwrap_or(0.0), grant.rate_hz.unwrap_or(0.0));
             let text =
                 format!("{wanted:.1} frames per second were requested, {granted:.1} are granted");
             self.warn(at(text));
@@ -178,7 +178,7 @@ impl<S: VideoSystem> Camera<S> {
         }
         let num_buffers = device.make_buffers(self.params.buffers).map_err(refused)?;
         if num_buffers < 2 {
-            return Err(Absence::passing(at(format!(
+            return Err(Absence::transient(at(format!(
                 "its driver allocates {num_buffers} buffers, two are needed"
             ))));
         }
@@ -190,8 +190,8 @@ impl<S: VideoSystem> Camera<S> {
         let rate = grant.rate_hz.map_or("unknown rate".to_owned(), |rate| format!("{rate:.1} Hz"));
         let text = format!(
             "{}x{} {}, {rate}, {num_buffers} buffers",
-            self.wish.width,
-            self.wish.height,
+            self.requested.width,
+            self.requested.height,
             grant.format.code()
         );
         note(&mut self.notices, at(text), false);
@@ -213,13 +213,13 @@ impl<S: VideoSystem> Camera<S> {
     }
 
     /// Checks a streaming camera once.
-    fn look(&mut self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<Arrival, Absence> {
+    fn poll(&mut self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<Arrival, Absence> {
         let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
         if stream.held.is_some() {
             return Ok(Arrival::Frame);
         }
         stream.return_idle()?;
-        self.see_to_exposure();
+        self.update_exposure();
         let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
         let is_ready = stream.device.wait(wake, millis).map_err(|error| stream.absence(error))?;
         if is_ready && self.drain()? == 0 {
@@ -237,7 +237,7 @@ impl<S: VideoSystem> Camera<S> {
         if silent_nanos as f64 > self.params.stall_s * 1e9 {
             let path = stream.path.display();
             let seconds = self.params.stall_s;
-            return Err(Absence::passing(format!(
+            return Err(Absence::transient(format!(
                 "{path}: has delivered no frame for {seconds} s"
             )));
         }
@@ -246,7 +246,7 @@ impl<S: VideoSystem> Camera<S> {
 
     /// Locks the settings to be locked once the camera has settled, and reads the exposure again if the camera changes
     /// it: also after a frame has been delivered, not only when none arrives.
-    fn see_to_exposure(&mut self) {
+    fn update_exposure(&mut self) {
         let now = self.system.now_nanos();
         let State::Streaming(stream) = &mut self.state else { return };
         let mut notices = Vec::new();
@@ -307,7 +307,7 @@ impl<S: VideoSystem> Camera<S> {
                 gain: stream.exposure.gain,
                 clocks: None,
             };
-            if let Some(older) = stream.held.replace(Held { filled, stamp }) {
+            if let Some(older) = stream.held.replace(HeldFrame { filled, stamp }) {
                 self.losses.late += 1;
                 stream.idle.push(older.filled.index);
                 stream.return_idle()?;
@@ -323,7 +323,7 @@ impl<S: VideoSystem> Camera<S> {
 
     /// The held frame, its layout and its bytes: those that the driver reports as filled, none if it reports more than
     /// there are.
-    pub fn held(&self) -> Option<(Held, Grant, &[u8])> {
+    pub fn held(&self) -> Option<(HeldFrame, Grant, &[u8])> {
         let State::Streaming(stream) = &self.state else { return None };
         let held = stream.held?;
         let memory = stream.device.memory(held.filled.index);
@@ -368,7 +368,7 @@ impl<D: VideoDevice> Stream<D> {
 
     fn absence(&self, error: Errno) -> Absence {
         let path = self.path.display();
-        Absence::passing(format!("{path}: {}", refusal(error, &path)))
+        Absence::transient(format!("{path}: {}", refusal(error, &path)))
     }
 }
 
@@ -389,11 +389,11 @@ fn refusal(error: Errno, path: &dyn std::fmt::Display) -> String {
 
 fn open_failure(name: &str, failure: OpenFailure) -> Absence {
     match failure {
-        OpenFailure::Missing => Absence::passing(format!(
+        OpenFailure::Missing => Absence::transient(format!(
             "there is no camera {name}; plug it in (`semidense cameras` lists the cameras)"
         )),
         OpenFailure::Refused(path, error) => {
-            Absence::passing(format!("{}: {}", path.display(), refusal(error, &path.display())))
+            Absence::transient(format!("{}: {}", path.display(), refusal(error, &path.display())))
         }
         OpenFailure::Ambiguous(paths) => {
             let names: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();

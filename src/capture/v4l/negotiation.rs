@@ -13,7 +13,7 @@ const MILLIHERTZ: f64 = 1000.0;
 
 /// The request.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Wish {
+pub struct StreamRequest {
     /// Width, pixels.
     pub width: u32,
     /// Height, pixels.
@@ -66,10 +66,13 @@ pub enum NegotiationError {
 
 /// Requests format, size and rate, and checks the grant. A rate that is not granted is not an error; the grant contains
 /// the actual one.
-pub fn negotiate(device: &mut dyn VideoDevice, wish: &Wish) -> Result<Grant, NegotiationError> {
+pub fn negotiate(
+    device: &mut dyn VideoDevice,
+    requested: &StreamRequest,
+) -> Result<Grant, NegotiationError> {
     check_capability(device)?;
-    let (format, layout) = agree_on_layout(device, wish)?;
-    let rate_hz = agree_on_rate(device, wish.rate_hz);
+    let (format, layout) = agree_on_layout(device, requested)?;
+    let rate_hz = agree_on_rate(device, requested.rate_hz);
     Ok(Grant { format, stride: layout.stride as usize, rate_hz })
 }
 
@@ -99,21 +102,21 @@ fn check_capability(device: &dyn VideoDevice) -> Result<(), NegotiationError> {
 
 /// Formats in the order of trial: those that reach the rate in their order, then the others, fastest first. If a driver
 /// does not report what it offers, all are tried.
-fn candidates(device: &dyn VideoDevice, wish: &Wish) -> Vec<PixelFormat> {
+fn candidates(device: &dyn VideoDevice, requested: &StreamRequest) -> Vec<PixelFormat> {
     let offered = device.formats();
     let is_wanted = |format: &PixelFormat| {
-        wish.format.is_none_or(|wanted| wanted == *format)
+        requested.format.is_none_or(|wanted| wanted == *format)
             && (offered.is_empty() || offered.iter().any(|o| o.code == format.code()))
     };
     let fastest = |format: PixelFormat| {
-        let periods = device.periods(format.code(), wish.width, wish.height);
+        let periods = device.periods(format.code(), requested.width, requested.height);
         periods.iter().map(|period| rate_hz(period.shortest)).reduce(f64::max)
     };
     let mut found: Vec<(PixelFormat, f64)> = PixelFormat::ALL
         .into_iter()
         .filter(is_wanted)
         .map(|format| {
-            let shortfall = match (wish.rate_hz, fastest(format)) {
+            let shortfall = match (requested.rate_hz, fastest(format)) {
                 (Some(wanted), Some(fastest)) => wanted * (1.0 - RATE_TOLERANCE) - fastest,
                 _ => 0.0,
             };
@@ -127,17 +130,17 @@ fn candidates(device: &dyn VideoDevice, wish: &Wish) -> Vec<PixelFormat> {
 
 fn agree_on_layout(
     device: &mut dyn VideoDevice,
-    wish: &Wish,
+    requested: &StreamRequest,
 ) -> Result<(PixelFormat, Layout), NegotiationError> {
     let mut found: Option<Layout> = None;
-    for format in candidates(device, wish) {
-        match device.set_layout(format.code(), wish.width, wish.height) {
+    for format in candidates(device, requested) {
+        match device.set_layout(format.code(), requested.width, requested.height) {
             // This format or size is not available; another may be.
             Err(Errno::INVAL) => {}
             Err(error) => return Err(NegotiationError::Device(error)),
             Ok(layout) if layout.code != format.code() => {}
             Ok(layout)
-                if (layout.width, layout.height) == (wish.width, wish.height)
+                if (layout.width, layout.height) == (requested.width, requested.height)
                     && is_usable(&layout) =>
             {
                 return Ok((format, layout));
@@ -153,7 +156,7 @@ fn agree_on_layout(
     let order = if layout.field > 1 { " interlaced" } else { "" };
     Err(NegotiationError::Size {
         found: format!("{}x{} {}{order}", layout.width, layout.height, layout.code),
-        wanted: format!("{}x{}", wish.width, wish.height),
+        wanted: format!("{}x{}", requested.width, requested.height),
         offered: offered_sizes(device),
     })
 }
@@ -187,8 +190,8 @@ mod tests {
     use super::*;
     use crate::capture::v4l::fake::Fake;
 
-    fn wish(format: Option<PixelFormat>, rate_hz: Option<f64>) -> Wish {
-        Wish { width: 640, height: 480, format, rate_hz }
+    fn requested(format: Option<PixelFormat>, rate_hz: Option<f64>) -> StreamRequest {
+        StreamRequest { width: 640, height: 480, format, rate_hz }
     }
 
     #[test]
@@ -198,14 +201,15 @@ mod tests {
             (PixelFormat::Mjpeg, &[(640, 480)], 30),
             (PixelFormat::Yuyv, &[(640, 480)], 10),
         ]);
-        let granted = |wish: Wish| negotiate(&mut webcam.device(), &wish).unwrap();
-        assert_eq!(granted(wish(None, Some(30.0))).format, PixelFormat::Mjpeg);
-        assert_eq!(granted(wish(None, Some(30.5))).format, PixelFormat::Mjpeg, "within 5 %");
-        assert_eq!(granted(wish(None, Some(60.0))).format, PixelFormat::Mjpeg, "the fastest");
-        let slow = granted(wish(None, Some(10.0)));
+        let granted =
+            |requested: StreamRequest| negotiate(&mut webcam.device(), &requested).unwrap();
+        assert_eq!(granted(requested(None, Some(30.0))).format, PixelFormat::Mjpeg);
+        assert_eq!(granted(requested(None, Some(30.5))).format, PixelFormat::Mjpeg, "within 5 %");
+        assert_eq!(granted(requested(None, Some(60.0))).format, PixelFormat::Mjpeg, "the fastest");
+        let slow = granted(requested(None, Some(10.0)));
         assert_eq!((slow.format, slow.stride), (PixelFormat::Yuyv, 1280));
-        assert_eq!(granted(wish(None, None)).format, PixelFormat::Yuyv);
-        assert_eq!(granted(wish(Some(PixelFormat::Mjpeg), None)).format, PixelFormat::Mjpeg);
+        assert_eq!(granted(requested(None, None)).format, PixelFormat::Yuyv);
+        assert_eq!(granted(requested(Some(PixelFormat::Mjpeg), None)).format, PixelFormat::Mjpeg);
         assert!(rate_differs(Some(60.0), Some(30.0)) && !rate_differs(Some(30.0), Some(29.97)));
     }
 
@@ -213,19 +217,19 @@ mod tests {
     fn rows_are_as_long_as_granted() {
         let padded = Fake::with_formats(&[(PixelFormat::Grey, &[(640, 480)], 30)]);
         padded.pad_rows(64);
-        let grant = negotiate(&mut padded.device(), &wish(None, Some(30.0))).unwrap();
+        let grant = negotiate(&mut padded.device(), &requested(None, Some(30.0))).unwrap();
         assert_eq!((grant.stride, grant.rate_hz), (704, Some(30.0)));
     }
 
     #[test]
     fn another_size_is_refused_with_the_sizes_offered() {
         let camera = Fake::with_formats(&[(PixelFormat::Yuyv, &[(320, 240), (1280, 720)], 30)]);
-        let error = negotiate(&mut camera.device(), &wish(None, None)).unwrap_err();
+        let error = negotiate(&mut camera.device(), &requested(None, None)).unwrap_err();
         assert_eq!(
             error.to_string(),
             "delivers 320x240 YUYV instead of 640x480; it offers 320x240, 1280x720"
         );
-        let grey = negotiate(&mut camera.device(), &wish(Some(PixelFormat::Grey), None));
+        let grey = negotiate(&mut camera.device(), &requested(Some(PixelFormat::Grey), None));
         assert_eq!(grey.unwrap_err(), NegotiationError::NoFormat { offered: "YUYV".to_owned() });
     }
 
@@ -234,7 +238,7 @@ mod tests {
         let fake = Fake::with_formats(&[(PixelFormat::Grey, &[(640, 480)], 30)]);
         let refused = |flags| {
             fake.set_capability_flags(flags);
-            negotiate(&mut fake.device(), &wish(None, None)).unwrap_err().to_string()
+            negotiate(&mut fake.device(), &requested(None, None)).unwrap_err().to_string()
         };
         assert!(refused(CAP_STREAMING).contains("no images"), "an output or metadata node");
         assert!(refused(CAP_VIDEO_CAPTURE).contains("cannot stream"));
@@ -245,7 +249,7 @@ mod tests {
     fn a_busy_camera_is_not_a_format_error() {
         let fake = Fake::with_formats(&[(PixelFormat::Grey, &[(640, 480)], 30)]);
         fake.refuse_layout(Errno::BUSY);
-        let error = negotiate(&mut fake.device(), &wish(None, None)).unwrap_err();
+        let error = negotiate(&mut fake.device(), &requested(None, None)).unwrap_err();
         assert_eq!(error, NegotiationError::Device(Errno::BUSY));
     }
 }

@@ -80,7 +80,7 @@ impl PixelFormat {
 
 /// Why a buffer is not a picture.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum BrokenPicture {
+pub enum InvalidPicture {
     /// Fewer bytes than the picture needs.
     #[error("only {found} of {needed} bytes received")]
     Short {
@@ -116,18 +116,18 @@ pub fn unpack_gray(
     (width, height): (usize, usize),
     samples: &mut Vec<u8>,
     gray: &mut [u8],
-) -> Result<(), BrokenPicture> {
+) -> Result<(), InvalidPicture> {
     let Some(row_bytes) = format.row_bytes(width) else {
         return decode_gray_into(bytes, width, height, samples, gray)
-            .map_err(|error| BrokenPicture::Jpeg(error.to_string()));
+            .map_err(|error| InvalidPicture::Jpeg(error.to_string()));
     };
     if stride < row_bytes || width == 0 || gray.len() != width * height {
-        return Err(BrokenPicture::Stride { stride, width, format });
+        return Err(InvalidPicture::Stride { stride, width, format });
     }
     // The last row needs no padding after it.
     let needed = height.saturating_sub(1).saturating_mul(stride).saturating_add(row_bytes);
     if bytes.len() < needed {
-        return Err(BrokenPicture::Short { found: bytes.len(), needed });
+        return Err(InvalidPicture::Short { found: bytes.len(), needed });
     }
     for (gray, row) in gray.chunks_exact_mut(width).zip(bytes.chunks(stride)) {
         let row = &row[..row_bytes];
@@ -274,7 +274,7 @@ mod tests {
         // Cameras send their pictures in buffers of fixed size.
         assert_eq!(unpack(&[&jpeg[..], &[0; 64]].concat()), Ok(90));
         for length in [0, 1, jpeg.len() / 2, jpeg.len() - 2, jpeg.len() - 1] {
-            assert!(matches!(unpack(&jpeg[..length]), Err(BrokenPicture::Jpeg(_))), "{length}");
+            assert!(matches!(unpack(&jpeg[..length]), Err(InvalidPicture::Jpeg(_))), "{length}");
         }
     }
 

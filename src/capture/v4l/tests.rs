@@ -94,7 +94,7 @@ fn a_torn_picture_is_one_error_and_the_next_frame_follows() {
         fake.pass(33_000_000);
         fake.give(frame(1, torn.to_vec()));
         let error = source.next_into(&mut vec![0; WIDTH * HEIGHT]).unwrap_err();
-        assert!(error.is_passing() && error.to_string().starts_with("v4l:0: "), "{error}");
+        assert!(error.is_transient() && error.to_string().starts_with("v4l:0: "), "{error}");
     }
     assert_eq!(next(&fake, &mut source, frame(3, jpeg)).1.sequence, 4);
     assert_eq!(source.losses().unwrap().broken, 2);
@@ -111,7 +111,7 @@ fn short_buffers_are_damaged_frames() {
                 let (bytes, flags) = (vec![0; 700], FLAG_TIMESTAMP_MONOTONIC);
                 fake.give(Event::Frame { bytes, used: Some(used), sequence, flags, age_nanos: 0 });
                 let error = source.next_into(&mut vec![0; WIDTH * HEIGHT]).unwrap_err();
-                assert!(error.is_passing(), "{format:?} {used}: {error}");
+                assert!(error.is_transient(), "{format:?} {used}: {error}");
             }
             assert_eq!(source.losses().unwrap().broken, 3);
         }

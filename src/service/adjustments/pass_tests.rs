@@ -40,7 +40,7 @@ fn a_new_keyframe_goes_first_and_waits_for_at_most_one_piece() {
             waits_since.get_or_insert(sequence);
         }
         walk.go(&mut adjustments);
-        let began = adjustments.away.map(|away| away.began);
+        let began = adjustments.in_flight.map(|in_flight| in_flight.began);
         if began == Some(adjustments.frames) && began != last {
             let is_piece = begun.recv().unwrap();
             assert_eq!(is_piece, waits_since.is_none(), "frame {sequence}");
@@ -60,7 +60,7 @@ fn a_piece_moves_the_map_and_odometry_does_not_jump() {
     for _ in 0..=14 {
         walk.go(&mut adjustments);
     }
-    while adjustments.away.is_some() {
+    while adjustments.in_flight.is_some() {
         adjustments.after_frame(&mut walk.mapper, walk.frames);
     }
     // Move a keyframe in the middle out of line.
@@ -87,12 +87,18 @@ fn a_piece_moves_the_map_and_odometry_does_not_jump() {
     };
     assert!(off(&walk) > 0.015, "{}", off(&walk));
     let camera = SE3 { translation: [0.06 * 17.0, 0.0, 0.0].into(), ..SE3::identity() };
-    let keyframe_from_camera = walk.mapper.keyframe().unwrap().world_from_keyframe.locate(&camera);
+    let keyframe_from_camera =
+        walk.mapper.keyframe().unwrap().world_from_keyframe.inverse_transform_pose(&camera);
     let mut pieces = 0;
-    while adjustments.away.is_some() {
+    while adjustments.in_flight.is_some() {
         adjustments.after_frame(&mut walk.mapper, walk.frames);
         pieces += 1;
-        let at = walk.mapper.keyframe().unwrap().world_from_keyframe.place(&keyframe_from_camera);
+        let at = walk
+            .mapper
+            .keyframe()
+            .unwrap()
+            .world_from_keyframe
+            .transform_pose(&keyframe_from_camera);
         assert!((at.inverse() * camera).log().norm() < 1e-9, "{at:?}");
     }
     assert!(pieces >= 3 && off(&walk) < 0.007, "{pieces}, {}", off(&walk));

@@ -19,10 +19,12 @@ fn walk(entry: Entry) -> (Walk, Vec<u64>) {
     for _ in 0..19 {
         walk.go(&mut adjustments);
         until(|| {
-            adjustments.pick_up(&mut walk.mapper);
-            adjustments.away.is_none() || entry != Entry::WhenReady
+            adjustments.apply_ready(&mut walk.mapper);
+            adjustments.in_flight.is_none() || entry != Entry::WhenReady
         });
-        left.extend(std::iter::from_fn(|| walk.mapper.take_left().map(|of| of.keyframe_id)));
+        left.extend(std::iter::from_fn(|| {
+            walk.mapper.take_keyframe_to_save().map(|of| of.keyframe_id)
+        }));
     }
     (walk, left)
 }

@@ -48,8 +48,9 @@ impl Walk {
             state: TrackingState::Tracking,
             keyframe_id: active.map_or(u64::MAX, |k| k.keyframe_id),
             world_from_camera,
-            keyframe_from_camera: active
-                .map_or(SE3::identity(), |k| k.world_from_keyframe.locate(&world_from_camera)),
+            keyframe_from_camera: active.map_or(SE3::identity(), |k| {
+                k.world_from_keyframe.inverse_transform_pose(&world_from_camera)
+            }),
             proposes_keyframe: k > 0 && k.is_multiple_of(KEYFRAME_INTERVAL),
             ..PoseEstimate::unknown(&frame)
         };
@@ -156,14 +157,14 @@ fn live_no_frame_waits_and_a_late_estimate_is_merged() {
     let before = walk.places();
     let_go.send(()).unwrap();
     // No frame arrives.
-    until(|| adjustments.pick_up(&mut walk.mapper).needs_publishing());
+    until(|| adjustments.apply_ready(&mut walk.mapper).needs_publishing());
     let record = adjustments.take_records().last().unwrap();
     assert_eq!(record.fate, Fate::Merged, "{record:?}");
     assert!(record.adjustment.keyframe_id < 2 && record.frames > 0, "{record:?}");
     assert_ne!(walk.places(), before);
     // The keyframe that had to wait is next.
     let_go.send(()).unwrap();
-    until(|| adjustments.pick_up(&mut walk.mapper).needs_publishing());
+    until(|| adjustments.apply_ready(&mut walk.mapper).needs_publishing());
     let record = adjustments.take_records().last().unwrap();
     assert_eq!((record.fate, record.adjustment.keyframe_id), (Fate::Entered, 2), "{record:?}");
 }
@@ -235,7 +236,7 @@ fn an_estimate_for_a_replaced_camera_is_dropped() {
         walk.go(&mut adjustments);
     }
     let mut next = Walk::new();
-    adjustments.orphan();
+    adjustments.abandon();
     for _ in 0..=6 {
         next.go(&mut adjustments);
     }
@@ -286,7 +287,7 @@ fn the_end_does_not_wait_long_for_a_thread_without_cpu() {
     let (optimise, let_go) = held();
     let mut adjustments = start(Entry::WhenReady, optimise);
     Walk::new().go(&mut adjustments);
-    assert!(adjustments.away.is_some());
+    assert!(adjustments.in_flight.is_some());
     // It returns although the estimate never comes back.
     drop(adjustments);
     drop(let_go);

@@ -19,7 +19,7 @@ pub enum Origin {
 
 /// A key with its value.
 #[derive(Debug, Clone, PartialEq)]
-pub struct KeyInForce {
+pub struct EffectiveKey {
     /// The dotted key, as the shipped file lists it.
     pub key: String,
     /// Its value as TOML.
@@ -34,10 +34,10 @@ pub struct KeyInForce {
 
 impl Config {
     /// Every key as [`Config::load`] gives it for the same file and settings, in the order of the shipped file.
-    pub fn keys_in_force(
+    pub fn effective_keys(
         file: Option<&Path>,
         settings: &[String],
-    ) -> Result<Vec<KeyInForce>, ConfigError> {
+    ) -> Result<Vec<EffectiveKey>, ConfigError> {
         let config = Self::load(file, settings)?;
         let of_file = file.map(Self::read_table).transpose()?.unwrap_or_default();
         let mut of_line = Table::new();
@@ -58,7 +58,7 @@ impl Config {
             let built_in = before.map(|(_, value)| value.clone()).filter(|old| *old != value);
             let listed = layout::listed(&key);
             let is_expert = listed != key;
-            KeyInForce { origin: origin(&key), key: listed, value, built_in, is_expert }
+            EffectiveKey { origin: origin(&key), key: listed, value, built_in, is_expert }
         });
         let (expert, user): (Vec<_>, Vec<_>) = keys.partition(|key| key.is_expert);
         Ok(user.into_iter().chain(expert).collect())
@@ -105,7 +105,7 @@ mod tests {
         std::fs::write(&path, "[mapper]\nthreads = 3\n[expert.mapping]\nmin_gradient = 6.5\n")
             .unwrap();
         let settings = ["mapper.threads=1".to_owned(), "instance=\"front\"".to_owned()];
-        let keys = Config::keys_in_force(Some(&path), &settings).unwrap();
+        let keys = Config::effective_keys(Some(&path), &settings).unwrap();
         let find = |name: &str| keys.iter().find(|key| key.key == name).unwrap();
         let threads = find("mapper.threads");
         assert_eq!((threads.value.as_str(), &threads.origin), ("1", &Origin::CommandLine));

@@ -46,7 +46,7 @@ fn presets_load_and_change_every_key_they_name() {
     let mut num_presets = 0;
     for entry in std::fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();
-        let keys = Config::keys_in_force(Some(&path), &[]).unwrap();
+        let keys = Config::effective_keys(Some(&path), &[]).unwrap();
         let (mut named, mut same) = (0, Vec::new());
         for key in keys.iter().filter(|key| key.origin == Origin::File(path.clone())) {
             assert!(!key.is_expert, "{}: {} is an expert's", path.display(), key.key);

@@ -36,7 +36,7 @@ pub(super) fn begin_folder(output: &Path) -> io::Result<PathBuf> {
 }
 
 /// Holds a log, to write it or to make results from it; `None` where another process holds it.
-pub fn hold(log: &Path) -> io::Result<Option<File>> {
+pub fn lock(log: &Path) -> io::Result<Option<File>> {
     let file = File::open(log)?;
     match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
         Ok(()) => Ok(Some(file)),
@@ -107,7 +107,7 @@ pub fn unfinished(place: Option<&Place>, output: &Path) -> Vec<Unfinished> {
         }
     }
     folders.extend(place.into_iter().flat_map(pointed_at));
-    let mut found: Vec<Unfinished> = folders.into_iter().filter_map(abandoned).collect();
+    let mut found: Vec<Unfinished> = folders.into_iter().filter_map(unlocked_journal).collect();
     found.sort();
     found.dedup();
     found
@@ -142,9 +142,9 @@ fn pointed_at(place: &Place) -> Vec<PathBuf> {
 }
 
 /// The journal in `folder`, if no process holds it.
-fn abandoned(folder: PathBuf) -> Option<Unfinished> {
+fn unlocked_journal(folder: PathBuf) -> Option<Unfinished> {
     let folder = folder.canonicalize().ok()?;
-    hold(&folder.join(LOG)).ok()??;
+    lock(&folder.join(LOG)).ok()??;
     let name = folder.file_name()?.to_string_lossy().into_owned();
     Some(Unfinished { stamp: name.strip_prefix(PREFIX)?.to_owned(), folder })
 }
@@ -161,7 +161,7 @@ mod tests {
         let folder = begin_folder(output.path()).unwrap();
         fs::write(folder.join(LOG), "x").unwrap();
         let pointer = Pointer::set(&place, &folder).unwrap();
-        let held = hold(&folder.join(LOG)).unwrap().unwrap();
+        let held = lock(&folder.join(LOG)).unwrap().unwrap();
         assert_eq!(unfinished(Some(&place), output.path()), []);
         drop(held);
         let nowhere = Path::new("/nowhere");

@@ -82,13 +82,13 @@ impl Recovered {
             // A log has one, as its first record.
             Record::Start(_) => {}
             // Reading the log does not check the contents of a pose; invalid ones are left out.
-            Record::Pose(pose) => drop(self.recording.take_pose(&pose)),
+            Record::Pose(pose) => drop(self.recording.add_pose(&pose)),
             Record::Step(step) => {
-                self.recording.take_step(step.step_nanos, step.change_nanos, step.start_frame)
+                self.recording.add_step(step.step_nanos, step.change_nanos, step.start_frame)
             }
             Record::Adjustment(message) => {
                 if let Ok(record) = adjustment_from_message(&message) {
-                    self.recording.take_adjustment(record);
+                    self.recording.add_adjustment(record);
                 }
             }
             Record::Counters(counters) => self.counters = *counters,

@@ -46,7 +46,7 @@ impl Refusals {
     const CALM: u32 = 60;
 
     /// Counts an outcome; returns whether it is a refusal not yet reported.
-    fn is_news(&mut self, is_refused: bool) -> bool {
+    fn is_new_refusal(&mut self, is_refused: bool) -> bool {
         self.successes = if is_refused { 0 } else { self.successes.saturating_add(1) };
         if self.successes >= Self::CALM {
             self.is_said = false;
@@ -107,7 +107,7 @@ impl Writer {
     }
 
     /// Keeps the log held, even after the thread has ended.
-    pub fn hold(&self) -> io::Result<File> {
+    pub fn lock(&self) -> io::Result<File> {
         self.log.try_clone()
     }
 
@@ -130,8 +130,8 @@ impl Writer {
         match entry {
             Entry::Log(records, poses) => {
                 let error = self.append(&records, poses).err();
-                let is_news = self.log_refusals.is_news(error.is_some());
-                error.filter(|_| is_news).map(|error| {
+                let is_new_refusal = self.log_refusals.is_new_refusal(error.is_some());
+                error.filter(|_| is_new_refusal).map(|error| {
                     format!(
                         "the journal has fallen behind ({error}); a kill would now lose more than a second of the run"
                     )
@@ -139,8 +139,8 @@ impl Writer {
             }
             Entry::Keyframe(keyframe) => {
                 let error = self.write_keyframe(*keyframe).err();
-                let is_news = self.depth_refusals.is_news(error.is_some());
-                error.filter(|_| is_news).map(|error| {
+                let is_new_refusal = self.depth_refusals.is_new_refusal(error.is_some());
+                error.filter(|_| is_new_refusal).map(|error| {
                     format!(
                         "cannot write the depth of a keyframe to the journal ({error}); a kill would now lose depth of the map"
                     )
@@ -227,7 +227,7 @@ fn is_out_of_room(error: &io::Error) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::service::journal::folder::hold;
+    use crate::service::journal::folder::lock;
     use crate::service::journal::log::{LogEnd, Record, Step, log_header, read_log};
     use crate::slam::geometry::intrinsics::Intrinsics;
     use crate::slam::geometry::se3::SE3;
@@ -263,12 +263,12 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let seen = folder.path().join(LOG);
         let writer = writer(folder.path());
-        assert!(hold(&seen).unwrap().is_none());
-        let held = writer.hold().unwrap();
+        assert!(lock(&seen).unwrap().is_none());
+        let held = writer.lock().unwrap();
         drop(writer);
-        assert!(hold(&seen).unwrap().is_none());
+        assert!(lock(&seen).unwrap().is_none());
         drop(held);
-        assert!(hold(&seen).unwrap().is_some());
+        assert!(lock(&seen).unwrap().is_some());
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 

@@ -4,8 +4,8 @@ use super::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, MapState};
+use crate::slam::keyframe_pose_covariance::{KeyframePoseCovariance, KeyframePoseMatrix};
 use crate::slam::modes::ModeCovariance;
-use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
 use nalgebra::Vector6;
 
 fn map() -> Map {
@@ -22,7 +22,7 @@ fn map() -> Map {
         map_from_keyframe: Sim3::new(rigid.inverse(), 2.3),
         map_revision: 3,
         mode_covariance: ModeCovariance::of_std_devs([0.1, 0.2, 0.3]),
-        place_covariance: PlaceCovariance::bounded(&(PlaceMatrix::identity() * 0.01)),
+        place_covariance: KeyframePoseCovariance::bounded(&(KeyframePoseMatrix::identity() * 0.01)),
         is_refined: true,
         intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
         image: (0..17 * 16).map(|i| (i % 251) as u8).collect(),
@@ -30,7 +30,7 @@ fn map() -> Map {
         description: None,
     };
     let keyframes = vec![keyframe.clone(), Keyframe { keyframe_id: 8, ..keyframe }];
-    let frame = FramePlace { sequence: 100, keyframe_id: 7, keyframe_from_camera: rigid };
+    let frame = FramePose { sequence: 100, keyframe_id: 7, keyframe_from_camera: rigid };
     let confirmed = ConfirmedPoint {
         keyframe_id: 8,
         u: 16,
@@ -41,7 +41,7 @@ fn map() -> Map {
     };
     Map {
         keyframes,
-        frames: vec![frame, FramePlace { sequence: 101, ..frame }],
+        frames: vec![frame, FramePose { sequence: 101, ..frame }],
         confirmed: vec![confirmed; 3],
         loops: Arc::new(crate::service::loop_bytes::tests::loops()),
         free_epoch: 18,

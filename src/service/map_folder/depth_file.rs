@@ -31,10 +31,10 @@ const MAGIC: [u8; 16] = *b"semidense depth\n";
 /// Version of the layout.
 const VERSION: u32 = 2;
 /// The previous version, which can still be read.
-const VERSION_BEFORE: u32 = 1;
+const PREVIOUS_VERSION: u32 = 1;
 /// Bytes before the description, and before the positions in the previous version.
-const HEAD_BYTES: usize = HEAD_BYTES_BEFORE + size_of::<PartBytes>();
-const HEAD_BYTES_BEFORE: usize = size_of::<Head>();
+const HEAD_BYTES: usize = PREVIOUS_HEAD_BYTES + size_of::<PartBytes>();
+const PREVIOUS_HEAD_BYTES: usize = size_of::<Head>();
 /// Bytes of the checksum.
 const CHECKSUM_BYTES: usize = 4;
 
@@ -99,15 +99,15 @@ pub enum DepthFileError {
 }
 
 /// Most bytes of the file of a keyframe with this many pixels.
-pub fn most_bytes(num_pixels: usize) -> usize {
+pub fn max_file_bytes(num_pixels: usize) -> usize {
     // A PNG of noise is a little larger than its samples.
     let image = 2 * num_pixels + 4096;
     let points = pixels::bit_bytes(num_pixels) + 12 * MAX_KEYFRAME_POINTS;
-    HEAD_BYTES + description::MOST_BYTES + image + points + CHECKSUM_BYTES
+    HEAD_BYTES + description::MAX_BYTES + image + points + CHECKSUM_BYTES
 }
 
 /// Most points that small detail keeps of an image with this many pixels.
-fn most_small_points(num_pixels: usize) -> usize {
+fn max_small_points(num_pixels: usize) -> usize {
     num_pixels.div_ceil(SMALL_PIXELS_PER_POINT).min(MAX_KEYFRAME_POINTS)
 }
 
@@ -115,7 +115,7 @@ fn most_small_points(num_pixels: usize) -> usize {
 /// the image and all but one per pixel are left out.
 pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
-    let mut points = in_order(keyframe);
+    let mut points = in_row_major_order(keyframe);
     let (mut step, mut coded, mut is_own_brightness) = (0, Cow::from(&keyframe.image[..]), false);
     match detail {
         MapDetail::Full => {
@@ -124,7 +124,7 @@ pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
                 .any(|point| point.intensity != brightness(&keyframe.image, width, point));
         }
         MapDetail::Small => {
-            points = best_of_groups(&points, most_small_points(width * height));
+            points = best_of_groups(&points, max_small_points(width * height));
             let (by, small) = small_image(&keyframe.image, width, height);
             (step, coded) = (by, Cow::from(small));
         }
@@ -149,7 +149,7 @@ pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
         deviations,
     };
     let sizes = PartBytes { places: places.len() as u32, description: described.len() as u32 };
-    let mut bytes = Vec::with_capacity(most_bytes(width * height).min(1 << 21));
+    let mut bytes = Vec::with_capacity(max_file_bytes(width * height).min(1 << 21));
     for part in [head.as_bytes(), sizes.as_bytes(), &described, &places, &coded[..]] {
         bytes.extend(part);
     }
@@ -206,7 +206,7 @@ pub fn decode_into(bytes: &[u8], keyframe: &mut Keyframe) -> Result<(), DepthFil
     let mut rest = bytes;
     let (head, part_bytes) = take_head(&mut rest).ok_or(DepthFileError::Length {
         found: bytes.len(),
-        expected: HEAD_BYTES_BEFORE + CHECKSUM_BYTES,
+        expected: PREVIOUS_HEAD_BYTES + CHECKSUM_BYTES,
     })?;
     let sizes = head.check(part_bytes, keyframe)?;
     let parts = sizes.description + sizes.places + sizes.image + sizes.numbers;
@@ -274,7 +274,7 @@ struct PartBytes {
 
 fn take_head(bytes: &mut &[u8]) -> Option<(Head, Option<PartBytes>)> {
     let head: Head = take(bytes)?;
-    let parts = if head.version == VERSION_BEFORE { None } else { Some(take(bytes)?) };
+    let parts = if head.version == PREVIOUS_VERSION { None } else { Some(take(bytes)?) };
     Some((head, parts))
 }
 
@@ -293,7 +293,7 @@ impl Head {
         if self.magic != MAGIC {
             return Err(DepthFileError::Magic);
         }
-        if self.version != VERSION_BEFORE && self.version != VERSION {
+        if self.version != PREVIOUS_VERSION && self.version != VERSION {
             return Err(DepthFileError::Version(self.version));
         }
         let (width, height) = (of.intrinsics.width, of.intrinsics.height);
@@ -303,7 +303,7 @@ impl Head {
             return Err(DepthFileError::Foreign);
         }
         let is_small = self.detail == 1;
-        let most_image = if is_small { most_bytes(width * height) } else { width * height };
+        let most_image = if is_small { max_file_bytes(width * height) } else { width * height };
         let bit_bytes = pixels::bit_bytes(width * height);
         let place_bytes = parts.map_or(bit_bytes, |parts| parts.places as usize);
         let description_bytes = parts.map_or(0, |parts| parts.description as usize);
@@ -314,7 +314,7 @@ impl Head {
             ("brightness", u64::from(self.is_own_brightness), u64::from(!is_small)),
             ("image bytes", self.image_bytes, most_image as u64),
             ("place bytes", place_bytes as u64, bit_bytes as u64),
-            ("description bytes", description_bytes as u64, description::MOST_BYTES as u64),
+            ("description bytes", description_bytes as u64, description::MAX_BYTES as u64),
         ];
         let wrong = checks.into_iter().find(|(_, value, most)| value > most);
         let least_image = if is_small { 0 } else { most_image as u64 };
@@ -389,7 +389,7 @@ impl Logarithms {
 }
 
 /// The points inside the image, in row-major order, one per pixel.
-fn in_order(keyframe: &Keyframe) -> Vec<DepthPoint> {
+fn in_row_major_order(keyframe: &Keyframe) -> Vec<DepthPoint> {
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
     let inside = |p: &&DepthPoint| usize::from(p.u) < width && usize::from(p.v) < height;
     let mut points: Vec<DepthPoint> = keyframe.points.iter().filter(inside).copied().collect();

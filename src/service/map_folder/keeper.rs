@@ -20,11 +20,11 @@ use crate::slam::map::Map;
 use crate::slam::mapper::{Mapper, StepOutcome};
 
 /// Keyframes that wait to be written; a slower disk gets the others later.
-const MOST_WAITING: usize = 8;
+const MAX_WAITING: usize = 8;
 
 /// Follows a mapper.
 #[derive(Debug)]
-pub struct MapKeeper {
+pub struct MapSaver {
     camera: Intrinsics,
     numbering: Numbering,
     shared: Arc<Shared>,
@@ -57,7 +57,7 @@ struct Waiting {
     failure: Option<String>,
 }
 
-impl MapKeeper {
+impl MapSaver {
     /// Keeps the map of `camera` in a folder. `loaded` is the map that the folder already holds; its keyframe numbers
     /// may differ from those of the mapper. Where frames may wait (`waits`) a save waits for the previous one, so that
     /// a kill costs at most one keyframe where frames arrive faster than the disk writes.
@@ -77,7 +77,7 @@ impl MapKeeper {
         let theirs = Arc::clone(&shared);
         let thread = std::thread::Builder::new()
             .name("semidense-save".to_owned())
-            .spawn(move || save_until_over(&theirs, &camera))?;
+            .spawn(move || save_until_stopped(&theirs, &camera))?;
         let handed = loaded.keyframes.iter().map(|of| (of.keyframe_id, of.revision));
         Ok(Self {
             camera,
@@ -109,13 +109,13 @@ impl MapKeeper {
                 Some(_) => {}
             }
         }
-        let head = self.numbering.head_on_disk(head_of(mapper));
+        let head = self.numbering.head_on_disk(map_head(mapper));
         let mut waiting = locked(&self.shared.waiting);
         while self.waits && (waiting.is_busy || waiting.head.is_some()) {
             waiting = self.shared.idle.wait(waiting).unwrap_or_else(PoisonError::into_inner);
         }
         for keyframe in new.into_iter().chain(changed.map(|(_, keyframe)| keyframe)) {
-            if waiting.keyframes.len() < MOST_WAITING
+            if waiting.keyframes.len() < MAX_WAITING
                 && let Some(on_disk) = self.numbering.on_disk(keyframe.clone())
             {
                 self.handed.insert(keyframe.keyframe_id, keyframe.revision);
@@ -156,7 +156,7 @@ impl MapKeeper {
             }
             self.handed.insert(keyframe.keyframe_id, keyframe.revision);
         }
-        let head = self.numbering.head_on_disk(head_of(mapper));
+        let head = self.numbering.head_on_disk(map_head(mapper));
         writer.save(&self.camera, head)?;
         writer.settle()
     }
@@ -174,7 +174,7 @@ pub(super) fn is_kept(keyframe: &Keyframe, camera: &Intrinsics) -> bool {
         && keyframe.intrinsics == *camera
 }
 
-impl Drop for MapKeeper {
+impl Drop for MapSaver {
     fn drop(&mut self) {
         locked(&self.shared.waiting).is_over = true;
         self.shared.wake.notify_one();
@@ -186,7 +186,7 @@ impl Drop for MapKeeper {
 }
 
 /// The list of all keyframes.
-pub(super) fn head_of(mapper: &Mapper) -> MapHead {
+pub(super) fn map_head(mapper: &Mapper) -> MapHead {
     let map = mapper.map();
     MapHead {
         keyframes: map.keyframes.iter().map(Keyframe::without_depth).collect(),
@@ -201,7 +201,7 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn save_until_over(shared: &Shared, camera: &Intrinsics) {
+fn save_until_stopped(shared: &Shared, camera: &Intrinsics) {
     loop {
         let mut waiting = locked(&shared.waiting);
         while waiting.head.is_none() && !waiting.is_over {

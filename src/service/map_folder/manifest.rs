@@ -19,10 +19,10 @@ use zerocopy::{FromBytes, Immutable, IntoBytes};
 use crate::service::bytes;
 use crate::service::loop_bytes::{loop_bytes, parse_loops};
 use crate::service::map_file::{keyframe_bytes, parse_keyframe};
-use crate::service::map_folder::depth_file::{MapDetail, most_bytes};
+use crate::service::map_folder::depth_file::{MapDetail, max_file_bytes};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, MAX_KEYFRAME_POINTS};
-use crate::slam::loops::known::KnownLoops;
+use crate::slam::loops::record::LoopRecord;
 
 /// First bytes of the file.
 const MAGIC: [u8; 16] = *b"semidense mapdir";
@@ -48,7 +48,7 @@ pub struct Manifest {
     /// First epoch number that is not in use.
     pub free_epoch: u32,
     /// Loops of the map.
-    pub loops: Arc<KnownLoops>,
+    pub loops: Arc<LoopRecord>,
     /// Number of corrections of the map.
     pub revision: u64,
     /// Number of saves.
@@ -229,7 +229,7 @@ impl Manifest {
                 && keyframe.intrinsics == self.camera
                 && keyframe.image.is_empty()
                 && keyframe.points.is_empty()
-                && file.bytes <= most_bytes(num_pixels) as u64
+                && file.bytes <= max_file_bytes(num_pixels) as u64
                 && file.num_points as usize <= MAX_KEYFRAME_POINTS
                 && file.revision <= MAX_REVISION;
             if !is_possible {

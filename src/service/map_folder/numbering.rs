@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::service::map_folder::writer::MapHead;
 use crate::slam::keyframe::Keyframe;
-use crate::slam::loops::known::KnownLoops;
+use crate::slam::loops::record::LoopRecord;
 use crate::slam::map::Map;
 use crate::slam::mapper::Mapper;
 
@@ -41,7 +41,7 @@ impl Numbering {
         };
         Map {
             keyframes: map.keyframes.into_iter().map(renumbered).collect(),
-            loops: Arc::new(KnownLoops::default().with(&map.loops, self.ids)),
+            loops: Arc::new(LoopRecord::default().with(&map.loops, self.ids)),
             revision: map.revision.saturating_add(self.revisions),
             free_epoch: map.free_epoch.saturating_add(self.epochs),
             ..map
@@ -95,7 +95,7 @@ mod tests {
         assert_eq!((in_run.revision, in_run.free_epoch), (24, 10));
         assert!(in_run.loops.links.iter().all(|link| link.i >= 100 && link.j >= 100));
         let before = [keyframe(0, 0), keyframe(99, 6)];
-        let loops = Arc::new(KnownLoops::default().with(&in_run.loops, 0).with(&map.loops, 0));
+        let loops = Arc::new(LoopRecord::default().with(&in_run.loops, 0).with(&map.loops, 0));
         assert_ne!(*loops, *in_run.loops);
         let head = numbering.head_on_disk(MapHead {
             keyframes: before.into_iter().chain(in_run.keyframes).collect(),

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use crate::capture::input_file;
 use crate::service::map_folder::depth_file::{
-    DepthFileError, checksum_of, decode_into, most_bytes,
+    DepthFileError, checksum_of, decode_into, max_file_bytes,
 };
 use crate::service::map_folder::manifest::{DepthFile, Listed, Manifest, ManifestError};
 use crate::service::map_folder::map_folder_error::MapFolderError;
@@ -144,7 +144,7 @@ fn read_depth(folder: &Path, file: &DepthFile, keyframe: &mut Keyframe) -> Resul
     };
     let num_pixels = keyframe.intrinsics.width * keyframe.intrinsics.height;
     let mut bytes = Vec::with_capacity(usize::try_from(file.bytes).unwrap_or(0));
-    input_file::read_into(&path, most_bytes(num_pixels) as u64, &mut bytes)
+    input_file::read_into(&path, max_file_bytes(num_pixels) as u64, &mut bytes)
         .map_err(|error| told(&error))?;
     // An intact file of another save has a valid checksum too.
     if checksum_of(&bytes) != file.checksum {

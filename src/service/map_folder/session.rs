@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::service::config::MapConfig;
-use crate::service::map_folder::keeper::MapKeeper;
+use crate::service::map_folder::keeper::MapSaver;
 use crate::service::map_folder::map_folder_error::{MapFolderError, check_same_camera};
 use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::reading::{Loaded, load, read_manifest};
@@ -41,7 +41,7 @@ pub struct MapSession {
     loaded: Option<Map>,
     camera: Option<Intrinsics>,
     writer: Option<MapWriter>,
-    keeper: Option<MapKeeper>,
+    keeper: Option<MapSaver>,
     numbering: Numbering,
     waits: bool,
 }
@@ -69,7 +69,7 @@ impl MapSession {
             Some(writer) if writer.camera().is_none() => None,
             _ => Some(load(&folder, max_bytes)?),
         };
-        loaded.iter().for_each(|loaded| tell_what_is_missing(loaded, max_bytes));
+        loaded.iter().for_each(|loaded| warn_about_damage(loaded, max_bytes));
         let camera = loaded.as_ref().map(|loaded| loaded.manifest.camera);
         let loaded = loaded.map(|loaded| numbering.in_run(loaded.map));
         let keeper = None;
@@ -89,17 +89,18 @@ impl MapSession {
         }
         let map = self.loaded.take().unwrap_or_default();
         if let Some(writer) = self.writer.take() {
-            let keeper = MapKeeper::start(writer, *camera, &map, self.numbering, self.waits)
+            let keeper = MapSaver::start(writer, *camera, &map, self.numbering, self.waits)
                 .map_err(MapSessionError::Thread)?;
             self.keeper = Some(keeper);
         }
-        let goes_on = |left: &Map| left.keyframes.iter().any(|of| of.intrinsics == *camera);
-        if let Some(left) = left.filter(|left| self.map_use == MapUse::Extend && goes_on(left)) {
-            return Ok(mapper.resume(left.over(map)));
+        let can_continue = |left: &Map| left.keyframes.iter().any(|of| of.intrinsics == *camera);
+        if let Some(left) = left.filter(|left| self.map_use == MapUse::Extend && can_continue(left))
+        {
+            return Ok(mapper.resume(left.merged_over(map)));
         }
         let folder = self.folder.clone();
         mapper
-            .begin_in(map, self.map_use)
+            .start_in_map(map, self.map_use)
             .map_err(|source| MapSessionError::Prior { folder, source })?;
         Ok(StepOutcome::default())
     }
@@ -162,7 +163,7 @@ pub fn check_loadable(folder: &Path, camera: &Intrinsics) -> Result<(), MapFolde
     check_same_camera(folder, &manifest.camera, camera)
 }
 
-fn tell_what_is_missing(loaded: &Loaded, max_bytes: usize) {
+fn warn_about_damage(loaded: &Loaded, max_bytes: usize) {
     const MEGABYTE: usize = 1_000_000;
     loaded.problems.iter().for_each(|problem| tracing::warn!("{problem}"));
     if loaded.without_memory > 0 {

@@ -172,7 +172,7 @@ fn a_damaged_description_is_recomputed_and_costs_nothing_else() {
     let camera = kept.intrinsics;
     let mut other = Mapper::new(camera, MapperParams::default()).unwrap();
     let begun = Map { keyframes: vec![kept.clone()], ..Map::default() };
-    other.begin_in(begun, MapUse::Extend).unwrap();
+    other.start_in_map(begun, MapUse::Extend).unwrap();
     let made = other.map().keyframes[0].description.clone();
     kept.description = made.clone();
     let mut writer = open(folder.path());
@@ -189,7 +189,7 @@ fn a_damaged_description_is_recomputed_and_costs_nothing_else() {
     assert!(loaded.problems.is_empty() && loaded.map.keyframes[0].description.is_none());
     assert!(loaded.map.keyframes[0].points == kept.points);
     let mut mapper = Mapper::new(camera, MapperParams::default()).unwrap();
-    mapper.begin_in(loaded.map, MapUse::Extend).unwrap();
+    mapper.start_in_map(loaded.map, MapUse::Extend).unwrap();
     assert_eq!(mapper.map().keyframes[0].description, made);
 }
 

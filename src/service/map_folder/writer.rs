@@ -17,7 +17,7 @@ use crate::service::map_folder::reading::{
 use crate::service::results::output_lock::lock_output;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::loops::known::KnownLoops;
+use crate::slam::loops::record::LoopRecord;
 use crate::wire::lock_file::{LockFile, Locking};
 
 /// The part of a map that its manifest holds.
@@ -26,7 +26,7 @@ pub struct MapHead {
     /// Keyframes without image and points, ordered by id.
     pub keyframes: Vec<Keyframe>,
     /// Its loops.
-    pub loops: Arc<KnownLoops>,
+    pub loops: Arc<LoopRecord>,
     /// Number of corrections of the map.
     pub revision: u64,
     /// First epoch number that is not in use.

@@ -14,8 +14,8 @@ use crate::service::map_folder::map_folder_error::MapFolderError;
 use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::save_copy;
 use crate::service::map_folder::session::{MapSession, check_loadable};
-use crate::service::mapper::going_over::GoneOver;
-use crate::service::mapper::{Shell, WRITES_MAP, tell_adjustments};
+use crate::service::mapper::switched_map::SwitchedMap;
+use crate::service::mapper::{Shell, WRITES_MAP, publish_adjustments};
 use crate::service::mode::Mode;
 use crate::service::run_error::RunError;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -41,20 +41,26 @@ impl Shell<'_> {
                 let map = self.mapper.as_ref().map(|(_, mapper)| mapper.map());
                 self.output.publish_earlier(map, keyframe_id)
             }
-            Command::SaveMap(path) => self.saying(WRITES_MAP, |shell| shell.save_map(&path)),
-            Command::SaveFolder(path) => self.saying(WRITES_MAP, |shell| shell.save_folder(&path)),
+            Command::SaveMap(path) => self.with_cause(WRITES_MAP, |shell| shell.save_map(&path)),
+            Command::SaveFolder(path) => {
+                self.with_cause(WRITES_MAP, |shell| shell.save_folder(&path))
+            }
             Command::LoadFolder { folder, read_only } => {
-                self.saying(LOADS_MAP, |shell| shell.load_folder(folder, read_only))
+                self.with_cause(LOADS_MAP, |shell| shell.load_folder(folder, read_only))
             }
         })?)
     }
 
     /// Reports `cause` during an act that may take longer than the pause between two signs of life.
-    fn saying(&mut self, cause: &str, act: impl FnOnce(&mut Self) -> Answer) -> Result<(), String> {
-        let before = self.health.entered();
+    fn with_cause(
+        &mut self,
+        cause: &str,
+        act: impl FnOnce(&mut Self) -> Answer,
+    ) -> Result<(), String> {
+        let before = self.health.current_state();
         self.health.enter(ProcessState::Running, cause);
         let outcome = act(self);
-        self.health.go_back_to(before);
+        self.health.restore_state(before);
         outcome.map_err(|error| error.to_string())
     }
 
@@ -63,7 +69,7 @@ impl Shell<'_> {
         if let Some((_, mapper)) = &mut self.mapper {
             let outcome = self.adjustments.finish(mapper);
             self.output.publish(mapper, &outcome)?;
-            tell_adjustments(&mut self.adjustments, &self.output, &mut self.health)?;
+            publish_adjustments(&mut self.adjustments, &self.output, &mut self.health)?;
         }
         let empty = Map::default();
         let map = self.mapper.as_ref().map_or(&empty, |(_, mapper)| mapper.map());
@@ -99,21 +105,21 @@ impl Shell<'_> {
             .to_str()
             .ok_or_else(|| format!("{}: name a folder whose name is UTF-8", folder.display()))?;
         let map = MapConfig { folder: name.to_owned(), read_only, ..self.config.map.clone() };
-        let (session, mut next) = self.begin_in(&map, &camera, numbering)?;
+        let (session, mut next) = self.start_in_map(&map, &camera, numbering)?;
         self.save_map_folder()?;
-        let gone_over = GoneOver { from: self.config.map.folder.clone(), to: map, numbering };
-        self.forget_checkpoint(&gone_over)?;
+        let switched = SwitchedMap { from: self.config.map.folder.clone(), to: map, numbering };
+        self.forget_checkpoint(&switched)?;
         if let Some((_, before)) = self.mapper.take() {
-            next.take_the_place_of(before);
+            next.replace_mapper(before);
         }
-        self.adjustments.orphan();
+        self.adjustments.abandon();
         tracing::info!("the mapper switches to the map {}", folder.display());
         (self.map, self.mapper) = (Some(session), Some((camera, next)));
         Ok(())
     }
 
     /// Makes a mapper that begins in a map, which is read while signs of life continue.
-    fn begin_in(
+    fn start_in_map(
         &mut self,
         map: &MapConfig,
         camera: &Intrinsics,
@@ -146,12 +152,12 @@ impl Shell<'_> {
     }
 
     /// Live: a successor begins in the other map, not with what was left of this one.
-    fn forget_checkpoint(&mut self, gone_over: &GoneOver) -> Result<(), String> {
+    fn forget_checkpoint(&mut self, switched: &SwitchedMap) -> Result<(), String> {
         let Some(mut kept) = self.kept.take() else { return Ok(()) };
         let (path, note) = (self.place.checkpoint_path(), self.place.loaded_map_path());
-        kept.end_in_order();
+        kept.remove_on_drop();
         drop(kept);
-        let written = gone_over.write(&note);
+        let written = switched.write(&note);
         self.kept = Kept::open(&path).0;
         self.kept.iter_mut().for_each(Kept::reserve);
         written.map_err(|error| format!("{}: {error}", note.display()))

@@ -120,7 +120,7 @@ impl Output {
             revision: keyframe.map_or(0, |k| k.revision),
             step_nanos,
             change_nanos,
-            keyframes: mapper.map().num_held() as u64,
+            keyframes: mapper.map().num_with_depth() as u64,
             points: keyframe.map_or(0, |k| k.points.len() as u64),
             pose_nanos: pose.map_or(0, |pose| pose.capture_nanos),
             world_from_camera: pose

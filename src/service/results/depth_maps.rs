@@ -17,7 +17,7 @@ pub fn evaluate_depth(
     for keyframe in of_epoch.filter(|k| is_evaluated(k)) {
         let true_depth = match source.depth_at(keyframe.capture_nanos) {
             // One damaged file must not cost the results.
-            Err(error) if error.is_passing() => {
+            Err(error) if error.is_transient() => {
                 tracing::warn!("skipping the depth comparison of a keyframe: {error}");
                 None
             }

@@ -26,7 +26,7 @@ fn points(map: &Map, max_relative_std_dev: f64) -> impl Iterator<Item = (&Keyfra
 }
 
 /// Position in the map of the pixel (u, v) of a keyframe with this inverse depth, map units.
-pub(super) fn in_world(keyframe: &Keyframe, [u, v]: [u16; 2], inverse_depth: f32) -> [f32; 3] {
+pub(super) fn in_map(keyframe: &Keyframe, [u, v]: [u16; 2], inverse_depth: f32) -> [f32; 3] {
     let ray = keyframe.intrinsics.ray(f64::from(u), f64::from(v));
     let place = keyframe.map_from_keyframe * (ray / f64::from(inverse_depth));
     [place.x as f32, place.y as f32, place.z as f32]
@@ -45,7 +45,7 @@ pub fn write_full_points(path: &Path, map: &Map, max_relative_std_dev: f64) -> i
              end_header\n"
         )?;
         points(map, max_relative_std_dev).try_for_each(|(keyframe, point)| {
-            let position = in_world(keyframe, [point.u, point.v], point.inverse_depth);
+            let position = in_map(keyframe, [point.u, point.v], point.inverse_depth);
             for number in position.iter().chain([&point.intensity, &point.variance]) {
                 file.write_all(&number.to_le_bytes())?;
             }

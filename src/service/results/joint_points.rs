@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use crate::service::atomic_file::write_atomically;
-use crate::service::results::full_points::in_world;
+use crate::service::results::full_points::in_map;
 use crate::slam::map::{ConfirmedPoint, Map};
 
 /// Writes the points of a map.
@@ -36,6 +36,6 @@ pub fn write_points(path: &Path, map: &Map) -> io::Result<()> {
 /// Position of a point in the map, map units; `None` where its keyframe is gone.
 fn position(map: &Map, point: &ConfirmedPoint) -> Option<[f32; 3]> {
     let keyframe = map.get(point.keyframe_id)?;
-    let position = in_world(keyframe, [point.u, point.v], point.inverse_depth);
+    let position = in_map(keyframe, [point.u, point.v], point.inverse_depth);
     position.iter().all(|x| x.is_finite()).then_some(position)
 }

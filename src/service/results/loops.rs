@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::service::adjustments::SearchRecord;
 use crate::service::results::times::Percentiles;
-use crate::slam::loops::SearchFate;
+use crate::slam::loops::SearchOutcome;
 
 /// The search for loops in a run; all `None` where a run does not report it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -37,20 +37,20 @@ impl LoopSummary {
     /// Summarises the searches of a run whose map has `keyframes` keyframes.
     pub fn of(records: Option<&[SearchRecord]>, keyframes: usize) -> Self {
         let Some(records) = records else { return Self::default() };
-        let count = |is: fn(&SearchFate) -> bool| {
-            Some(records.iter().filter(|record| is(&record.report.fate)).count() as u64)
+        let count = |is: fn(&SearchOutcome) -> bool| {
+            Some(records.iter().filter(|record| is(&record.report.outcome)).count() as u64)
         };
         let nanos: u64 = records.iter().map(|record| record.nanos).sum();
         Self {
-            loop_searches: count(|fate| *fate != SearchFate::Proposed),
+            loop_searches: count(|outcome| *outcome != SearchOutcome::Proposed),
             loop_pairs: Some(records.iter().map(|of| u64::from(of.report.compared)).sum()),
-            loops_closed: count(|fate| *fate == SearchFate::Closed),
-            loops_held: count(|fate| *fate == SearchFate::Held),
-            epochs_joined: count(|fate| *fate == SearchFate::Joined),
-            loops_against_drift: count(|fate| matches!(fate, SearchFate::AgainstDrift(_))),
-            loops_unconfirmed: count(|fate| *fate == SearchFate::Unconfirmed),
-            loops_inconsistent: count(|fate| *fate == SearchFate::Inconsistent),
-            loops_refused: count(|fate| matches!(fate, SearchFate::Refused(_))),
+            loops_closed: count(|outcome| *outcome == SearchOutcome::Closed),
+            loops_held: count(|outcome| *outcome == SearchOutcome::AlreadyConsistent),
+            epochs_joined: count(|outcome| *outcome == SearchOutcome::Joined),
+            loops_against_drift: count(|outcome| matches!(outcome, SearchOutcome::AgainstDrift(_))),
+            loops_unconfirmed: count(|outcome| *outcome == SearchOutcome::Unconfirmed),
+            loops_inconsistent: count(|outcome| *outcome == SearchOutcome::Inconsistent),
+            loops_refused: count(|outcome| matches!(outcome, SearchOutcome::Refused(_))),
             loop_search_ms: Percentiles::of(records.iter().map(|record| record.nanos)),
             loop_search_ms_per_keyframe: (keyframes > 0)
                 .then(|| 1e-6 * nanos as f64 / keyframes as f64),

@@ -57,7 +57,7 @@ pub fn final_poses(record: &RunRecord) -> Vec<EpochPose> {
             None => (estimate.keyframe_id, &estimate.keyframe_from_camera),
         };
         let (epoch, place) = match places.get(&keyframe_id) {
-            Some(keyframe) => (keyframe.epoch, keyframe.map_from_keyframe.place(at)),
+            Some(keyframe) => (keyframe.epoch, keyframe.map_from_keyframe.transform_pose(at)),
             None => (estimate.epoch, estimate.map_from_camera),
         };
         let pose = StampedPose { nanos: estimate.capture_nanos, world_from_camera: place };

@@ -221,7 +221,7 @@ mod tests {
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Sim3;
     use crate::slam::keyframe::Keyframe;
-    use crate::slam::map::PlacedFrame;
+    use crate::slam::map::RealignedFrame;
     use crate::slam::pose::{LostReason, TrackingState};
 
     const LOST: TrackingState = TrackingState::Lost(LostReason::TooFewInliers);
@@ -246,7 +246,11 @@ mod tests {
         record.poses[40..].iter_mut().for_each(|pose| pose.estimate.state = LOST);
         for sequence in 50..60 {
             let keyframe_from_camera = SE3::identity();
-            record.map.place_frame(&PlacedFrame { sequence, keyframe_id: 3, keyframe_from_camera });
+            record.map.store_frame_pose(&RealignedFrame {
+                sequence,
+                keyframe_id: 3,
+                keyframe_from_camera,
+            });
         }
         let text = summary_text(&summary(&record));
         assert!(text.contains(" 60 in, 40 tracked (10 of them afterwards), 10 lost, "), "{text}");

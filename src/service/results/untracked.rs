@@ -12,7 +12,7 @@ use crate::slam::mapper::situation::StartFrame;
 use crate::slam::pose::{LostReason, TrackingState};
 
 /// Fewest frames with which a map can begin and one be tracked on it: a start is confirmed by its third.
-const FEWEST_FRAMES: u64 = 5;
+const MIN_FRAMES: u64 = 5;
 
 /// The machine mapped too few of the frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -86,10 +86,10 @@ impl Untracked {
         let is_far_apart =
             matches!(seen, StartFrame::Unmatched | StartFrame::Turned | StartFrame::LittleParallax);
         let slowness = slowness(record, frames_in);
-        if let Some(slowness) = slowness.filter(|_| is_far_apart || all < FEWEST_FRAMES) {
+        if let Some(slowness) = slowness.filter(|_| is_far_apart || all < MIN_FRAMES) {
             return Some(Self::TooSlow(slowness));
         }
-        Some(match frames_in < FEWEST_FRAMES {
+        Some(match frames_in < MIN_FRAMES {
             true => Self::FewFrames(frames_in),
             false => Self::Seen(seen, count, all),
         })
@@ -227,10 +227,10 @@ pub(super) mod tests {
             if sequence >= 10 {
                 (estimate.state, estimate.keyframe_id) = (state, 3);
             }
-            recording.take_pose(&pose_message(&estimate, &PoseTiming::default())).unwrap();
+            recording.add_pose(&pose_message(&estimate, &PoseTiming::default())).unwrap();
         }
         const UNMATCHED: u32 = 5;
-        (0..handled).for_each(|_| recording.take_step(40_000_000, 0, UNMATCHED));
+        (0..handled).for_each(|_| recording.add_step(40_000_000, 0, UNMATCHED));
         recording.into_record(RecordParts {
             mode: RunMode::Live,
             source: "x".to_owned(),

@@ -220,7 +220,7 @@ impl Aligner {
 
     /// Evaluates an alignment that was cut short on the finest level at this pose, without a step: there its statistics
     /// show how well it fits, and it can be compared with others.
-    pub fn stand_on_finest(
+    pub fn evaluate_on_finest(
         &self,
         reference: &Reference,
         frame: &SumPyramid,
@@ -323,7 +323,7 @@ impl Aligner {
     /// The sums of an alignment on its level as if every depth were exact, so that several alignments can be compared.
     /// (∂r/∂d)² V grows with the translation, so that with its own σ_r the alignment farthest from the keyframe would
     /// explain any image best; and no single translation is fair to all, since it would be that of one of them.
-    pub fn explanation(
+    pub fn sums_with_exact_depth(
         &self,
         reference: &Reference,
         frame: &SumPyramid,

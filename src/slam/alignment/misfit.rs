@@ -24,7 +24,7 @@ impl TileMisfit {
     pub fn of(tiles: &[TileSum; NUM_TILES]) -> Self {
         let (mut squares, mut noises) = ([0.0; NUM_TILES], [0.0; NUM_TILES]);
         let mut count = 0;
-        for (square, noise) in tiles.iter().filter_map(best_known) {
+        for (square, noise) in tiles.iter().filter_map(best_determined) {
             (squares[count], noises[count]) = (square, noise);
             count += 1;
         }
@@ -45,7 +45,7 @@ impl TileMisfit {
 
 /// Squared displacement of a tile along the direction in which it is determined best, and its variance, radians²: with
 /// the largest eigenvalue λ of its information and the unit eigenvector e, ((e·g)/λ)² and 1/λ.
-fn best_known(tile: &TileSum) -> Option<(f64, f64)> {
+fn best_determined(tile: &TileSum) -> Option<(f64, f64)> {
     let [xx, xy, yy] = tile.information.map(f64::from);
     let gradient = [tile.gradient[3], tile.gradient[4]].map(f64::from);
     let half_difference = 0.5 * (xx - yy);

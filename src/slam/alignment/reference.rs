@@ -11,9 +11,9 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid, grey_per_sum};
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use crate::slam::keyframe_pose_covariance::UncertainPose;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::NO_KEYFRAME;
 
 /// Which points of a keyframe are aligned.
@@ -76,7 +76,7 @@ pub struct Reference {
     sequence: u64,
     map_state: MapState,
     world_from_keyframe: Sim3,
-    place: UncertainPlace,
+    place: UncertainPose,
     map_revision: u64,
     intrinsics: Intrinsics,
     mean_inverse_depth: f64,
@@ -116,7 +116,7 @@ impl Reference {
             sequence: 0,
             map_state: MapState::Established,
             world_from_keyframe: Sim3::identity(),
-            place: UncertainPlace::exact(Sim3::identity()),
+            place: UncertainPose::exact(Sim3::identity()),
             map_revision: 0,
             intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 0, height: 0 },
             mean_inverse_depth: 1.0,
@@ -147,7 +147,7 @@ impl Reference {
             keyframe.world_from_keyframe.is_valid() && keyframe.map_from_keyframe.is_valid();
         let or_identity = |place: Sim3| if placed { place } else { Sim3::identity() };
         self.world_from_keyframe = or_identity(keyframe.world_from_keyframe);
-        self.place = keyframe.uncertain_place();
+        self.place = keyframe.uncertain_pose();
         self.place.map_from_keyframe = or_identity(keyframe.map_from_keyframe);
         self.map_revision = keyframe.map_revision;
         self.intrinsics = keyframe.intrinsics;
@@ -185,7 +185,7 @@ impl Reference {
         self.keyframe_id = NO_KEYFRAME;
         self.map_state = MapState::Established;
         self.world_from_keyframe = Sim3::identity();
-        self.place = UncertainPlace::exact(Sim3::identity());
+        self.place = UncertainPose::exact(Sim3::identity());
         self.intrinsics = *intrinsics;
         self.mean_inverse_depth = 1.0;
         self.mode_covariance = mode_covariance;
@@ -201,7 +201,7 @@ impl Reference {
     }
 
     /// Places the view in world and map, with the standard deviation of the distance of frames from it, in its units.
-    pub fn stand_at(&mut self, world_from_view: &Sim3, expected_distance: f64) {
+    pub fn place_view(&mut self, world_from_view: &Sim3, expected_distance: f64) {
         self.world_from_keyframe = *world_from_view;
         self.place.map_from_keyframe = *world_from_view;
         self.translation_information = 1.0 / (expected_distance * expected_distance);
@@ -262,7 +262,7 @@ impl Reference {
                 inverse_depth: candidate.inverse_depth,
                 variance: candidate.variance,
                 surrounding_inverse_depth: if is_finest {
-                    surroundings.without(&candidate)
+                    surroundings.mean_excluding(&candidate)
                 } else {
                     candidate.inverse_depth
                 },
@@ -315,7 +315,7 @@ impl Reference {
     }
 
     /// The keyframe's pose in the map with its uncertainty.
-    pub fn uncertain_place(&self) -> UncertainPlace {
+    pub fn uncertain_pose(&self) -> UncertainPose {
         self.place
     }
 

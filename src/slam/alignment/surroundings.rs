@@ -16,7 +16,7 @@ const TILE_PX: usize = 8;
 const LEVEL_COUNT: f32 = 0.5;
 
 /// Share of a tile's information below which the rest without a point is rounding error.
-const LEAST_REST: f32 = 1.0e-3;
+const MIN_REMAINDER: f32 = 1.0e-3;
 
 /// Sums of inverse depth over tiles, in reusable memory.
 #[derive(Debug, Clone, Default)]
@@ -56,12 +56,12 @@ impl Surroundings {
     }
 
     /// Mean inverse depth around `candidate`, one of those measured, excluding its own.
-    pub fn without(&self, candidate: &LevelPoint) -> f32 {
+    pub fn mean_excluding(&self, candidate: &LevelPoint) -> f32 {
         let tile = self.tiles.get(self.tile_of(candidate)).copied().unwrap_or_default();
         let own = 1.0 / candidate.variance;
         // Rounding must not leave a remainder where the point is alone.
         let others = tile.information - own;
-        let others = if others > LEAST_REST * tile.information { others } else { 0.0 };
+        let others = if others > MIN_REMAINDER * tile.information { others } else { 0.0 };
         let level = LEVEL_COUNT * self.mean_information;
         let mean = if others > 0.0 {
             (tile.weighted - own * candidate.inverse_depth).max(0.0) / others
@@ -100,7 +100,7 @@ mod tests {
         // The mean of all, 3, has the weight of half a point.
         let expected = [(2.0 + 1.5) / 1.5, (1.0 + 1.5) / 1.5, 3.0];
         for (index, expected) in expected.into_iter().enumerate() {
-            let found = surroundings.without(&level[index]);
+            let found = surroundings.mean_excluding(&level[index]);
             assert!((found - expected).abs() < 1e-6, "point {index}: {found}, not {expected}");
         }
     }

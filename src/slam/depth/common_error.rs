@@ -32,7 +32,7 @@ const MAX_SAMPLES: usize = 1500;
 /// Step between sampled rows.
 const ROW_STEP: usize = 5;
 /// Relative standard deviation of depth below which points have equal weight: surfaces are not flat to a pixel.
-const LEAST_RELATIVE_STD_DEV: f64 = 0.02;
+const MIN_RELATIVE_STD_DEV: f64 = 0.02;
 /// Pyramid level on which the alignment of frames ends.
 const ALIGNED_LEVEL: usize = 1;
 /// Variance of the difference of two images there, grey levels²: the effect of a pose on it weights all points alike.
@@ -40,7 +40,7 @@ const INTENSITY_VARIANCE: f64 = 2.0 * ImageNoise::DEFAULT.variance(ALIGNED_LEVEL
 /// Least depth of a point in the frame, as a share of its depth in the keyframe.
 const NEAREST_DEPTH_RATIO: f64 = 0.1;
 /// cos² between gradient and epipolar line below which a pixel is not matched.
-const LEAST_ALIGNMENT: f64 = 0.02;
+const MIN_SQUARED_COSINE: f64 = 0.02;
 
 /// A hypothesis before a frame was observed.
 #[derive(Debug, Clone, Copy)]
@@ -123,13 +123,13 @@ impl Sample {
             phi: Vector4::new(1.0, self.ray.x, self.ray.y, d.ln()),
             weight: 1.0 / (INTENSITY_VARIANCE + q * q * relative_variance),
             fit_weight: fit_weight(relative_variance),
-            is_observable: q * q > LEAST_ALIGNMENT * best,
+            is_observable: q * q > MIN_SQUARED_COSINE * best,
         })
     }
 }
 
 fn fit_weight(relative_variance: f64) -> f64 {
-    1.0 / (relative_variance + LEAST_RELATIVE_STD_DEV * LEAST_RELATIVE_STD_DEV)
+    1.0 / (relative_variance + MIN_RELATIVE_STD_DEV * MIN_RELATIVE_STD_DEV)
 }
 
 impl SampledDepth {
@@ -181,7 +181,11 @@ impl SampledDepth {
 
     /// The effect of the observation of a frame on the modes: `after` is the map since [`SampledDepth::take`]. `None`
     /// if nothing was observed.
-    pub fn observed(&self, after: &DepthMap, current_from_keyframe: &SE3) -> Option<ModeResponse> {
+    pub fn response_to_observation(
+        &self,
+        after: &DepthMap,
+        current_from_keyframe: &SE3,
+    ) -> Option<ModeResponse> {
         let (mut fit, mut gained) = (Matrix4::zeros(), Matrix4::zeros());
         let mut by_pose = SMatrix::<f64, 4, 6>::zeros();
         for sample in &self.samples {
@@ -204,7 +208,7 @@ impl SampledDepth {
     }
 
     /// The modes of depth that was estimated from one frame at this pose alone.
-    pub fn begun(&self, current_from_keyframe: &SE3) -> Option<ModesByPose> {
+    pub fn modes_by_pose(&self, current_from_keyframe: &SE3) -> Option<ModesByPose> {
         let mut fit = Matrix4::zeros();
         let mut by_pose = SMatrix::<f64, 4, 6>::zeros();
         let terms = self.samples.iter().filter_map(|s| s.terms(current_from_keyframe));
@@ -217,7 +221,7 @@ impl SampledDepth {
     }
 
     /// The propagation of the modes to a keyframe at this pose.
-    pub fn carried(
+    pub fn response_to_propagation(
         &self,
         current_from_keyframe: &SE3,
         intrinsics: &Intrinsics,

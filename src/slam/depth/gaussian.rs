@@ -4,6 +4,7 @@
 use rayon::prelude::*;
 
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
+use crate::slam::depth::expected_gain::{LANES, PixelLanes, worth_observing};
 use crate::slam::depth::gain::{Gain, Uncertainty};
 use crate::slam::depth::gradient_image::{BORDER_PX, GradientImage};
 use crate::slam::depth::hypotheses::{ChangedColumns, ListedRow};
@@ -12,7 +13,6 @@ use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::matching::{
     Conditioning, Match, MatchingParams, Miss, Patch, SearchRange, condition, is_inside, search,
 };
-use crate::slam::depth::promise::{LANES, PixelLanes, promises};
 use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
 use crate::slam::image::quads_kernel::Sampled;
@@ -111,8 +111,8 @@ pub fn observe(
     matching: &MatchingParams,
     params: &GaussianParams,
 ) -> Observation {
-    let [known, unknown] = map.hypotheses.count_beside(&map.candidates);
-    let is_short_of_depth = unknown > MOST_UNKNOWN_PER_KNOWN * known;
+    let [known, unknown] = map.hypotheses.count_known_and_unknown(&map.candidates);
+    let is_short_of_depth = unknown > MAX_UNKNOWN_PER_KNOWN * known;
     let pixel = PixelObserver {
         max_new_search_px: match is_short_of_depth {
             true => matching.max_search_px.max(params.max_first_search_px),
@@ -137,7 +137,7 @@ pub fn observe(
 }
 
 /// A keyframe with more candidates without depth than this per candidate with depth is short of depth.
-const MOST_UNKNOWN_PER_KNOWN: usize = 2;
+const MAX_UNKNOWN_PER_KNOWN: usize = 2;
 
 /// One in this many pixels is probed, on behalf of the others.
 pub const PROBE_STEP: usize = 32;
@@ -208,7 +208,7 @@ impl PixelObserver<'_> {
                 }
             }
         }
-        lists.note(&changed, row, candidates);
+        lists.update_lists(&changed, row, candidates);
         seen
     }
 
@@ -245,13 +245,14 @@ impl PixelObserver<'_> {
         let Observer { image: frame, view, .. } = self.observer;
         let size = (frame.width(), frame.height());
         let enough = self.params.max_variance_ratio;
-        let promises = promises(&pixels, v as f32, view, size, self.gain, enough, self.matching);
-        for (&u, &promises) in columns.iter().zip(&promises) {
+        let worth_observing =
+            worth_observing(&pixels, v as f32, view, size, self.gain, enough, self.matching);
+        for (&u, &worth_observing) in columns.iter().zip(&worth_observing) {
             let u = usize::from(u);
             if skips_propagated && row[u].propagated {
                 continue;
             }
-            if promises {
+            if worth_observing {
                 self.update(sampler, &mut row[u], u, v, seen);
             } else if (u + PROBE_ROW_SHIFT * v).is_multiple_of(PROBE_STEP) {
                 self.probe(sampler, &row[u], u, v, &mut seen.counts);
@@ -291,7 +292,7 @@ impl PixelObserver<'_> {
         let Observation { counts, innovations } = seen;
         let centre = hypothesis.smoothed;
         let Some((line, _, conditioning)) = self.conditioned(centre, u, v) else { return };
-        let left = Gain::of(hypothesis.uncertainty(), conditioning.promise()).left;
+        let left = Gain::of(hypothesis.uncertainty(), conditioning.predicted_uncertainty()).left;
         if left.variance > self.params.max_variance_ratio * hypothesis.variance {
             return;
         }
@@ -312,7 +313,7 @@ impl PixelObserver<'_> {
                 let innovation = found.inverse_depth - hypothesis.inverse_depth;
                 innovations.add(
                     innovation / conditioning.inverse_depth_per_px,
-                    conditioning.own_std_dev(),
+                    conditioning.match_std_dev_px(),
                 );
                 if self.fuse(hypothesis, &found) {
                     counts.fused += 1;

@@ -125,7 +125,7 @@ impl Hypotheses {
     }
 
     /// Number of hypotheses, and of candidates without one.
-    pub(super) fn count_beside(&self, candidates: &Image<bool>) -> [usize; 2] {
+    pub(super) fn count_known_and_unknown(&self, candidates: &Image<bool>) -> [usize; 2] {
         let pixels = self.pixels().iter().zip(candidates.pixels());
         let unknown = match self.lists.is_valid {
             true => self.lists.counts.iter().map(|counts| usize::from(counts.unknown)).sum(),
@@ -216,7 +216,7 @@ impl RowLists<'_> {
 
     /// Updates the lists after an observation.
     #[inline(always)]
-    pub(super) fn note(
+    pub(super) fn update_lists(
         &mut self,
         changed: &ChangedColumns,
         hypotheses: &[Hypothesis],
@@ -254,16 +254,16 @@ impl RowLists<'_> {
 
 /// Columns whose hypothesis was created or removed by an observation.
 pub(super) struct ChangedColumns {
-    columns: [u16; Self::MOST],
+    columns: [u16; Self::MAX_COLUMNS],
     count: usize,
 }
 
 impl ChangedColumns {
     /// With more changes the row is listed anew.
-    const MOST: usize = 32;
+    const MAX_COLUMNS: usize = 32;
 
     pub(super) fn none() -> Self {
-        Self { columns: [0; Self::MOST], count: 0 }
+        Self { columns: [0; Self::MAX_COLUMNS], count: 0 }
     }
 
     #[inline(always)]
@@ -328,7 +328,7 @@ mod tests {
                         changed.push(u);
                     }
                 }
-                lists.note(&changed, hypotheses, candidates);
+                lists.update_lists(&changed, hypotheses, candidates);
             });
             check(&mut hypotheses, &candidates);
             // Also where there is no candidate, set by hand.

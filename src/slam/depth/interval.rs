@@ -83,11 +83,11 @@ impl IntervalFilter {
 
     /// Restarts with the hypotheses of `map` and, between them, evenly chosen points of unknown depth. If a start or a
     /// sensor gave depth to every pixel, only the chosen ones keep it.
-    pub fn restart_with_known(&mut self, map: &mut DepthMap, params: &CandidateParams) {
+    pub fn restart_from_map(&mut self, map: &mut DepthMap, params: &CandidateParams) {
         /// More hypotheses than this multiple of the wanted number mean a map with depth at every pixel.
-        const MOST_PER_WANTED: usize = 3;
+        const MAX_HYPOTHESES_PER_WANTED: usize = 3;
         self.selector.choose(&map.image, params, &mut self.candidates);
-        if map.num_hypotheses() > MOST_PER_WANTED * params.wanted {
+        if map.num_hypotheses() > MAX_HYPOTHESES_PER_WANTED * params.wanted {
             self.chosen.clear();
             self.chosen.extend(self.candidates.iter().map(|c| map.index(c.u, c.v)));
             self.chosen.sort_unstable();

@@ -10,7 +10,7 @@ pub const MAX_STEPS: usize = 100;
 /// Costs that are compared at once.
 const LANES: usize = 8;
 /// Room for the costs, including those that belong to the minimum at the last one.
-const MOST_COSTS: usize = (MAX_STEPS + 2).next_multiple_of(LANES);
+const MAX_COSTS: usize = (MAX_STEPS + 2).next_multiple_of(LANES);
 
 /// The patch as a function of its position λ along the line, pixels from λ = 0.
 pub(super) struct Along<'a, S> {
@@ -38,8 +38,8 @@ pub(super) struct Best {
 impl<S: Instructions> Along<'_, S> {
     /// The position λ alone.
     #[inline(always)]
-    pub(super) fn only(&self, lambda: f32) -> Best {
-        let seen = self.look(lambda);
+    pub(super) fn evaluate_at(&self, lambda: f32) -> Best {
+        let seen = self.sample_at(lambda);
         Best { lambda, seen, cost: self.cost(&seen), second: f32::INFINITY }
     }
 
@@ -48,23 +48,23 @@ impl<S: Instructions> Along<'_, S> {
     pub(super) fn scan(&self, first: f32, steps: usize) -> Best {
         /// Steps this close to the minimum belong to it.
         const SAME_MINIMUM_STEPS: usize = 2;
-        let mut costs = [f32::INFINITY; MOST_COSTS];
+        let mut costs = [f32::INFINITY; MAX_COSTS];
         for (begin, costs) in (0..=steps).step_by(LANES).zip(costs.chunks_exact_mut(LANES)) {
             let mut terms = [[f32::INFINITY; 8]; LANES];
             for (step, terms) in (begin..=steps).zip(&mut terms) {
-                *terms = self.terms(&self.look(first + step as f32));
+                *terms = self.terms(&self.sample_at(first + step as f32));
             }
             costs.copy_from_slice(&sums(self.frame.sampler, &terms));
         }
         // The minimum is searched afterwards: along the way a new minimum is an unpredictable branch.
         let padded = (steps + 1).next_multiple_of(LANES);
-        let least = least(&costs[..padded]);
+        let least = minimum(&costs[..padded]);
         let best = costs[..=steps].iter().position(|&cost| cost == least).unwrap_or(0);
         let lambda = first + best as f32;
         let cost = costs[best];
         costs[best.saturating_sub(SAME_MINIMUM_STEPS)..=best + SAME_MINIMUM_STEPS]
             .fill(f32::INFINITY);
-        Best { lambda, seen: self.look(lambda), cost, second: self::least(&costs[..padded]) }
+        Best { lambda, seen: self.sample_at(lambda), cost, second: self::minimum(&costs[..padded]) }
     }
 
     /// Gauss–Newton along the line from `best` with clamped steps until the cost stops falling: the final position and
@@ -79,7 +79,7 @@ impl<S: Instructions> Along<'_, S> {
         const MAX_ITERATIONS: usize = 4;
         const MAX_STEP_PX: f32 = 0.75;
         /// Avoids division by zero for a patch without gradient, grey levels².
-        const LEAST_INFORMATION: f32 = 1e-6;
+        const MIN_INFORMATION: f32 = 1e-6;
         /// Step below which further ones change the depth less than sampling noise.
         const CONVERGED_PX: f32 = 0.03;
         let start = best.lambda;
@@ -87,11 +87,11 @@ impl<S: Instructions> Along<'_, S> {
         for _ in 0..MAX_ITERATIONS {
             let [gradient, information] =
                 slope(self.frame.sampler, &seen, self.intensity, &gradients_at(lambda));
-            let step = -gradient / (information + LEAST_INFORMATION);
+            let step = -gradient / (information + MIN_INFORMATION);
             let next = (lambda + step.clamp(-MAX_STEP_PX, MAX_STEP_PX))
                 .clamp(start - reach, start + reach);
             let moved = (next - lambda).abs();
-            let there = self.look(next);
+            let there = self.sample_at(next);
             let cost_there = self.cost(&there);
             if !(cost_there < cost) {
                 break;
@@ -107,7 +107,7 @@ impl<S: Instructions> Along<'_, S> {
     /// Gradients of the frame along the line under the patch, grey levels per pixel.
     #[inline(always)]
     pub(super) fn gradients(&self, lambda: f32) -> [f32; 8] {
-        let (ahead, behind) = (self.look(lambda + 1.0), self.look(lambda - 1.0));
+        let (ahead, behind) = (self.sample_at(lambda + 1.0), self.sample_at(lambda - 1.0));
         let mut gradients = [0.0; 8];
         for k in 0..PATTERN.len() {
             gradients[k] = 0.5 * (ahead[k] - behind[k]);
@@ -117,7 +117,7 @@ impl<S: Instructions> Along<'_, S> {
 
     /// Samples of the frame under the patch.
     #[inline(always)]
-    fn look(&self, lambda: f32) -> [f32; 8] {
+    fn sample_at(&self, lambda: f32) -> [f32; 8] {
         let (du, dv) = (lambda * self.direction.0, lambda * self.direction.1);
         let Sampled { image, sampler } = self.frame;
         sampler.sample(image, &self.u.map(|u| u + du), &self.v.map(|v| v + dv))
@@ -136,7 +136,7 @@ impl<S: Instructions> Along<'_, S> {
 
 /// The least of several costs, in whole registers; infinite if all are NaN.
 #[inline(always)]
-fn least(costs: &[f32]) -> f32 {
+fn minimum(costs: &[f32]) -> f32 {
     let lower = |one: f32, other: f32| if other < one { other } else { one };
     let mut least = [f32::INFINITY; LANES];
     for costs in costs.chunks_exact(LANES) {

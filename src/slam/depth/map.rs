@@ -72,12 +72,17 @@ impl DepthMap {
     /// Restarts on a new image: no hypotheses, candidates where ‖g‖ ≥ `min_gradient`, which is raised for the whole
     /// image until at most `max_candidates` remain.
     pub fn restart(&mut self, pixels: &[u8], min_gradient: f32, max_candidates: usize) {
-        self.show(pixels, min_gradient, max_candidates);
+        self.restart_without_structure(pixels, min_gradient, max_candidates);
         self.sum_structure();
     }
 
     /// The same without the structure, which only observation needs: depth can be propagated to the map.
-    pub fn show(&mut self, pixels: &[u8], min_gradient: f32, max_candidates: usize) {
+    pub fn restart_without_structure(
+        &mut self,
+        pixels: &[u8],
+        min_gradient: f32,
+        max_candidates: usize,
+    ) {
         self.image.fill(pixels);
         let rows = self.hypotheses.pixels_mut().par_chunks_exact_mut(self.image.width());
         rows.with_min_len(BAND_ROWS).for_each(|row| row.fill(Hypothesis::NONE));

@@ -274,13 +274,13 @@ impl LineAxes {
 impl Conditioning {
     /// Uncertainty of the inverse depth after a match.
     #[inline(always)]
-    pub fn promise(&self) -> Uncertainty {
+    pub fn predicted_uncertainty(&self) -> Uncertainty {
         self.times(self.inverse_depth_per_px * self.inverse_depth_per_px)
     }
 
     /// Standard deviation of a match due to image noise, sampling and slant, pixels.
     #[inline(always)]
-    pub fn own_std_dev(&self) -> f32 {
+    pub fn match_std_dev_px(&self) -> f32 {
         self.own_variance.sqrt()
     }
 
@@ -342,7 +342,8 @@ pub fn search<S: Instructions>(
     let along = along(frame, patch, conditioning, middle);
     let steps =
         if length < MIN_SEARCH_PX { 0 } else { (length.ceil() as usize).min(MAX_STEPS - 1) };
-    let best = if steps == 0 { along.only(0.0) } else { along.scan(-0.5 * steps as f32, steps) };
+    let best =
+        if steps == 0 { along.evaluate_at(0.0) } else { along.scan(-0.5 * steps as f32, steps) };
     let gradients = patch.gradients_along(conditioning.along);
     let (lambda, cost) = along.refine(&best, |_| gradients, REFINE_REACH_PX);
     let mean_squared_residual = cost / PATTERN.len() as f32;

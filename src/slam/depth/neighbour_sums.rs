@@ -18,10 +18,10 @@ pub(super) const LANES: usize = 16;
 const SQUARED_DISTANCES: [f32; 6] = [0.0, 1.0, 2.0, 4.0, 5.0, 8.0];
 
 /// Index of a neighbour's squared distance, by the absolute differences in row and column.
-const PLACE_OF_DISTANCE: [[usize; RADIUS + 1]; RADIUS + 1] = [[0, 1, 3], [1, 2, 4], [3, 4, 5]];
+const INDEX_OF_DISTANCE: [[usize; RADIUS + 1]; RADIUS + 1] = [[0, 1, 3], [1, 2, 4], [3, 4, 5]];
 
 /// Keeps the weight of an exact pixel finite: far below any variance that a match can have.
-const LEAST_VARIANCE: f32 = 1e-12;
+const MIN_VARIANCE: f32 = 1e-12;
 
 /// A row of the map before smoothing, by quantity, followed by a block without hypotheses.
 #[derive(Debug, Clone)]
@@ -89,7 +89,7 @@ impl RowPlanes {
         for (plane, squared) in self.weights.iter_mut().zip(SQUARED_DISTANCES) {
             let mut weights = [0.0; LANES];
             for k in 0..LANES {
-                weights[k] = present[k] / (variance[k].max(LEAST_VARIANCE) + spread * squared);
+                weights[k] = present[k] / (variance[k].max(MIN_VARIANCE) + spread * squared);
             }
             store(plane, first, &weights);
         }
@@ -162,7 +162,7 @@ pub(super) fn smoothing_sums(
     let (mut weighted, mut weights, mut count) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
     for (y, row) in around.iter().enumerate() {
         for x in 0..WINDOW_ROWS {
-            let place = PLACE_OF_DISTANCE[y.abs_diff(RADIUS)][x.abs_diff(RADIUS)];
+            let place = INDEX_OF_DISTANCE[y.abs_diff(RADIUS)][x.abs_diff(RADIUS)];
             let from = first + x - RADIUS;
             let (depths, variances) = (lanes(&row.inverse_depth, from), lanes(&row.variance, from));
             let by_distance = lanes(&row.weights[place], from);

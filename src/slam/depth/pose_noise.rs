@@ -13,16 +13,16 @@ const UNKNOWNS: usize = 6;
 /// With the ray (x, y, 1): ∂(u, v)/∂t = f (1, 0, −x; 0, 1, −y) d, ∂(u, v)/∂ω = f (−xy, 1+x², −y; −(1+y²), xy, x).
 pub fn pose_noise_px(intrinsics: &Intrinsics, covariance: &[f64; 21]) -> f64 {
     /// Positions along each side: the centres of its thirds.
-    const PLACES: [f64; 3] = [1.0 / 6.0, 0.5, 5.0 / 6.0];
+    const SAMPLE_POSITIONS: [f64; 3] = [1.0 / 6.0, 0.5, 5.0 / 6.0];
     let Intrinsics { fx, fy, cx, cy, width, height } = *intrinsics;
     let mut variance = 0.0;
-    for (column, row) in PLACES.iter().flat_map(|c| PLACES.map(|r| (c, r))) {
+    for (column, row) in SAMPLE_POSITIONS.iter().flat_map(|c| SAMPLE_POSITIONS.map(|r| (c, r))) {
         let (x, y) = ((column * width as f64 - cx) / fx, (row * height as f64 - cy) / fy);
         let along_u = [1.0, 0.0, -x, -x * y, 1.0 + x * x, -y].map(|j| fx * j);
         let along_v = [0.0, 1.0, -y, -(1.0 + y * y), x * y, x].map(|j| fy * j);
         variance += quadratic_form(covariance, &along_u) + quadratic_form(covariance, &along_v);
     }
-    let places = (PLACES.len() * PLACES.len()) as f64;
+    let places = (SAMPLE_POSITIONS.len() * SAMPLE_POSITIONS.len()) as f64;
     // An invalid covariance must not count as an exact pose.
     if variance.is_finite() { (variance / (2.0 * places)).max(0.0).sqrt() } else { f64::INFINITY }
 }

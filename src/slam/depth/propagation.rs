@@ -74,12 +74,12 @@ pub fn propagate(
         reprojected.clear();
         let (first, end) = (band * BAND_ROWS, (band + 1) * BAND_ROWS);
         let rows = first.max(BORDER_PX)..end.min(height - BORDER_PX);
-        kernel.run(CarriedRows { reprojection: &reprojection, rows, reprojected });
+        kernel.run(PropagatedRows { reprojection: &reprojection, rows, reprojected });
     });
     // In the order of the source's rows: the result depends on which hypothesis reaches a pixel first.
     let present = target.hypotheses.pixels_mut();
     for &(index, arriving) in reprojected.iter().flatten() {
-        settle(&mut present[index as usize], arriving);
+        merge_or_occlude(&mut present[index as usize], arriving);
     }
     target.reprojected = reprojected;
 }
@@ -98,7 +98,7 @@ struct Reprojection<'a> {
 const LANES: usize = 16;
 
 /// Projections of [`LANES`] source pixels.
-struct Places {
+struct Projections {
     u: [f32; LANES],
     v: [f32; LANES],
     depth_ratio: [f32; LANES],
@@ -109,24 +109,24 @@ struct Places {
 }
 
 /// Source rows whose hypotheses are propagated, and the results, in their order.
-struct CarriedRows<'a> {
+struct PropagatedRows<'a> {
     reprojection: &'a Reprojection<'a>,
     rows: Range<usize>,
     reprojected: &'a mut Vec<Reprojected>,
 }
 
-impl Body for CarriedRows<'_> {
+impl Body for PropagatedRows<'_> {
     type Output = ();
 
     #[inline(always)]
     fn run<I: Instructions>(self, _: I) {
-        self.reprojection.carry_rows(self.rows, self.reprojected);
+        self.reprojection.propagate_rows(self.rows, self.reprojected);
     }
 }
 
 impl Reprojection<'_> {
     #[inline(always)]
-    fn carry_rows(&self, rows: Range<usize>, reprojected: &mut Vec<Reprojected>) {
+    fn propagate_rows(&self, rows: Range<usize>, reprojected: &mut Vec<Reprojected>) {
         let mut memory = Vec::new();
         for v in rows {
             let hypotheses = self.source.hypotheses.row(v);
@@ -136,7 +136,7 @@ impl Reprojection<'_> {
                 let inside = columns.iter().enumerate().filter(|(k, _)| places.inside[*k]);
                 reprojected.extend(inside.filter_map(|(k, &u)| {
                     let u = usize::from(u);
-                    self.arrive(
+                    self.reproject(
                         &hypotheses[u],
                         f32::from(self.source.image.intensity.at(u, v)),
                         &places,
@@ -150,7 +150,7 @@ impl Reprojection<'_> {
     /// The projections of some hypotheses of row `v`, with the same operations as
     /// [`EpipolarLine::project`](crate::slam::depth::epipolar::EpipolarLine::project).
     #[inline(always)]
-    fn project(&self, hypotheses: &[Hypothesis], columns: &[u16], v: usize) -> Places {
+    fn project(&self, hypotheses: &[Hypothesis], columns: &[u16], v: usize) -> Projections {
         let (m, kt) = (&self.view.rotation, &self.view.translation);
         let (width, height) = (self.target.image.width(), self.target.image.height());
         let margin = BORDER_PX as f32;
@@ -163,7 +163,7 @@ impl Reprojection<'_> {
         let v = v as f32;
         let zero = [0.0; LANES];
         let inside = [false; LANES];
-        let mut places = Places { u: zero, v: zero, depth_ratio: zero, r_z: zero, inside };
+        let mut places = Projections { u: zero, v: zero, depth_ratio: zero, r_z: zero, inside };
         for k in 0..LANES {
             let u = columns_u[k];
             let pr_u = m[0][0] * u + m[0][1] * v + m[0][2];
@@ -186,11 +186,11 @@ impl Reprojection<'_> {
 
     /// The hypothesis `from`, of a pixel of this `intensity`, at its projection, if the brightness there matches.
     #[inline(always)]
-    fn arrive(
+    fn reproject(
         &self,
         from: &Hypothesis,
         intensity: f32,
-        places: &Places,
+        places: &Projections,
         k: usize,
     ) -> Option<Reprojected> {
         let (image, params) = (&self.target.image, self.params);
@@ -209,13 +209,21 @@ impl Reprojection<'_> {
         if !(residual <= params.max_residual + params.residual_per_gradient * gradient) {
             return None;
         }
-        Some((index as u32, carry(from, places.depth_ratio[k], places.r_z[k], params)))
+        Some((
+            index as u32,
+            propagated_hypothesis(from, places.depth_ratio[k], places.r_z[k], params),
+        ))
     }
 }
 
 /// One hypothesis in the target's coordinates: `depth_ratio = d'/d`, `r_z` as in the formula above.
 #[inline(always)]
-fn carry(from: &Hypothesis, depth_ratio: f32, r_z: f32, params: &PropagationParams) -> Hypothesis {
+fn propagated_hypothesis(
+    from: &Hypothesis,
+    depth_ratio: f32,
+    r_z: f32,
+    params: &PropagationParams,
+) -> Hypothesis {
     let stretch = r_z * depth_ratio * depth_ratio;
     let inverse_depth = from.smoothed * depth_ratio;
     let process = params.process_noise_ratio * inverse_depth;
@@ -232,12 +240,12 @@ fn carry(from: &Hypothesis, depth_ratio: f32, r_z: f32, params: &PropagationPara
 
 /// Merges two hypotheses on one pixel: fused if consistent, else the nearer one hides the other.
 #[inline]
-fn settle(present: &mut Hypothesis, arriving: Hypothesis) {
+fn merge_or_occlude(present: &mut Hypothesis, arriving: Hypothesis) {
     if !present.is_some() {
         *present = arriving;
         return;
     }
-    match joined(*present, &arriving) {
+    match merged_hypothesis(*present, &arriving) {
         Some(joined) => *present = joined,
         None if arriving.inverse_depth > present.inverse_depth => *present = arriving,
         None => {}
@@ -246,7 +254,7 @@ fn settle(present: &mut Hypothesis, arriving: Hypothesis) {
 
 /// Two hypotheses of one pixel as one; `None` if they are on different surfaces.
 #[inline]
-pub fn joined(one: Hypothesis, other: &Hypothesis) -> Option<Hypothesis> {
+pub fn merged_hypothesis(one: Hypothesis, other: &Hypothesis) -> Option<Hypothesis> {
     /// Joint standard deviations within which two hypotheses are one surface.
     const SAME_SURFACE_SIGMAS: f32 = 2.0;
     let difference = other.inverse_depth - one.inverse_depth;
@@ -369,15 +377,15 @@ mod tests {
             failures: 0,
         };
         let mut pixel = at(1.0, 1e-4);
-        settle(&mut pixel, at(2.0, 1e-4));
+        merge_or_occlude(&mut pixel, at(2.0, 1e-4));
         assert_eq!(pixel.inverse_depth, 2.0);
-        settle(&mut pixel, at(1.0, 1e-4));
+        merge_or_occlude(&mut pixel, at(1.0, 1e-4));
         assert_eq!(pixel.inverse_depth, 2.0);
-        settle(&mut pixel, at(2.01, 1e-4));
+        merge_or_occlude(&mut pixel, at(2.01, 1e-4));
         assert!((pixel.inverse_depth - 2.005).abs() < 1e-5);
         assert_eq!(pixel.variance, 1e-4);
         // Without variances there is no weighting.
-        assert!(joined(at(1.0, 0.0), &at(1.0, 0.0)).is_none());
+        assert!(merged_hypothesis(at(1.0, 0.0), &at(1.0, 0.0)).is_none());
     }
 
     #[test]
@@ -407,7 +415,7 @@ mod tests {
         let rows = BORDER_PX..SCENE_CAMERA.height - BORDER_PX;
         let (mut portable, mut fast) = (Vec::new(), Vec::new());
         let carry = |kernel: Kernel, reprojected| {
-            kernel.run(CarriedRows { reprojection: &carrier, rows: rows.clone(), reprojected });
+            kernel.run(PropagatedRows { reprojection: &carrier, rows: rows.clone(), reprojected });
         };
         carry(Kernel::Portable, &mut portable);
         carry(Kernel::fastest(), &mut fast);

@@ -32,7 +32,7 @@ impl Segment {
 }
 
 /// The best match on a segment.
-pub(super) struct Found {
+pub(super) struct SegmentMatch {
     /// Position, pixels from the segment's start.
     pub(super) lambda: f32,
     /// Cost there.
@@ -45,9 +45,14 @@ pub(super) struct Found {
 
 /// Searches a segment for the patch, starting `dither` pixels before its start.
 #[inline(always)]
-pub(super) fn search(image: &QuadImage, segment: &Segment, patch: &[f32; 8], dither: f32) -> Found {
+pub(super) fn search(
+    image: &QuadImage,
+    segment: &Segment,
+    patch: &[f32; 8],
+    dither: f32,
+) -> SegmentMatch {
     /// Energies below one squared grey level are rounding error.
-    const LEAST_ENERGY: f32 = 1.0;
+    const MIN_ENERGY: f32 = 1.0;
     /// Reach of the refinement, pixels: to the steps next to the best.
     const REFINE_REACH_PX: f32 = 1.5;
     let along = Along {
@@ -59,8 +64,8 @@ pub(super) fn search(image: &QuadImage, segment: &Segment, patch: &[f32; 8], dit
     };
     let steps = ((segment.length + dither).ceil() as usize + 1).min(MAX_STEPS - 1);
     let best = along.scan(-dither, steps - 1);
-    let quality = best.second / best.cost.max(LEAST_ENERGY);
+    let quality = best.second / best.cost.max(MIN_ENERGY);
     // The interval filter keeps no gradients of its patch: the frame's are nearly the same.
     let (lambda, energy) = along.refine(&best, |lambda| along.gradients(lambda), REFINE_REACH_PX);
-    Found { lambda, energy, quality, steps }
+    SegmentMatch { lambda, energy, quality, steps }
 }

@@ -64,7 +64,7 @@ pub fn evaluate_epochs(
 }
 
 fn place(epoch: u32, pose: &StampedPose, truth_from_epoch: &Sim3) -> EpochPose {
-    let world_from_camera = truth_from_epoch.place(&pose.world_from_camera);
+    let world_from_camera = truth_from_epoch.transform_pose(&pose.world_from_camera);
     EpochPose { epoch, pose: StampedPose { nanos: pose.nanos, world_from_camera } }
 }
 

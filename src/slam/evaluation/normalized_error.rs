@@ -19,7 +19,7 @@ use crate::slam::trajectory::StampedPose;
 pub const CHI_SQUARE_BOUND: f64 = 12.6;
 
 /// Frames on a keyframe below which the fit of its scale would absorb their error.
-pub(super) const LEAST_FRAMES: usize = 5;
+pub(super) const MIN_FRAMES: usize = 5;
 
 /// Normalised errors over many frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -92,7 +92,7 @@ pub fn normalized_errors(
         }
     }
     let of_keyframe = |frames: &Vec<(&PoseEstimate, SE3)>| {
-        let unit = unit_length(frames).filter(|_| frames.len() >= LEAST_FRAMES);
+        let unit = unit_length(frames).filter(|_| frames.len() >= MIN_FRAMES);
         let errors = frames.iter().filter_map(|(estimate, current_from_keyframe)| {
             let mut true_pose = *current_from_keyframe;
             true_pose.translation /= unit?;
@@ -121,7 +121,7 @@ pub fn map_normalized_errors(
     let matched: Vec<(SE3, SE3, [f64; 21])> = matched.collect();
     let map_from_truth = similarity(matched.iter().map(|of| (of.0, of.1)))?;
     let errors = matched.iter().filter_map(|(found, exact, covariance)| {
-        let exact = map_from_truth.place(exact);
+        let exact = map_from_truth.transform_pose(exact);
         normalized(&(exact * found.inverse()).log(), covariance)
     });
     NormalizedErrors::of(&errors.collect::<Vec<_>>())
@@ -247,8 +247,8 @@ mod tests {
         let mut noise = Noise(5);
         for (estimate, exact) in estimates.iter_mut().zip(&truth) {
             let error = Vector6::from_fn(|row, _| STD_DEV[row] * noise.normal());
-            estimate.map_from_camera =
-                SE3::exp(&error).inverse() * map_from_truth.place(&exact.world_from_camera);
+            estimate.map_from_camera = SE3::exp(&error).inverse()
+                * map_from_truth.transform_pose(&exact.world_from_camera);
             estimate.map_covariance = covariance(1.0);
         }
         let measure = |estimates: &[PoseEstimate], truth: &[StampedPose]| {

@@ -11,7 +11,7 @@ use nalgebra::Vector6;
 
 use crate::slam::evaluation::association::nearest;
 use crate::slam::evaluation::normalized_error::{
-    LEAST_FRAMES, NormalizedErrors, normalized, unit_length,
+    MIN_FRAMES, NormalizedErrors, normalized, unit_length,
 };
 use crate::slam::geometry::se3::SE3;
 use crate::slam::pose::PoseEstimate;
@@ -70,7 +70,7 @@ fn world_units(
         }
     }
     let unit = |&(id, nanos): &(u64, i64)| {
-        let frames = by_keyframe.get(&id).filter(|frames| frames.len() >= LEAST_FRAMES)?;
+        let frames = by_keyframe.get(&id).filter(|frames| frames.len() >= MIN_FRAMES)?;
         let keyframe = true_pose(nanos)?;
         let known = frames.iter().filter_map(|estimate| {
             Some((*estimate, true_pose(estimate.capture_nanos)?.inverse() * keyframe))
@@ -134,7 +134,7 @@ mod tests {
         let world_from_truth = Sim3::new(SE3::exp(&twist), 1.0 / WORLD_M);
         let estimate = |frame: u64| {
             let keyframe = frame * 2 / FRAMES;
-            let place = |frame: u64| world_from_truth.place(&exact(frame));
+            let place = |frame: u64| world_from_truth.transform_pose(&exact(frame));
             let world_from_keyframe =
                 Sim3::new(place(keyframe * FRAMES / 2), UNITS[keyframe as usize]);
             let moved = |from: u64| (exact(from).inverse() * exact(from + 1)).log() / 0.04;
@@ -152,7 +152,7 @@ mod tests {
             PoseEstimate {
                 keyframe_id: keyframe,
                 world_from_camera: place(frame),
-                keyframe_from_camera: world_from_keyframe.locate(&place(frame)),
+                keyframe_from_camera: world_from_keyframe.inverse_transform_pose(&place(frame)),
                 velocity: (frame > 0).then(|| Velocity {
                     linear: velocity.fixed_rows::<3>(0).into_owned(),
                     angular: velocity.fixed_rows::<3>(3).into_owned(),
@@ -173,8 +173,8 @@ mod tests {
             estimate.keyframe_id = 0;
             let on_second = Sim3::new(to_first, UNITS[1] * WORLD_M);
             let first_unit = Sim3::new(SE3::identity(), UNITS[0] * WORLD_M);
-            estimate.keyframe_from_camera =
-                first_unit.locate(&on_second.place(&estimate.keyframe_from_camera));
+            estimate.keyframe_from_camera = first_unit
+                .inverse_transform_pose(&on_second.transform_pose(&estimate.keyframe_from_camera));
             estimate.world_from_camera.translation += Vector3::new(40.0, 0.0, 0.0);
         }
         let truth: Vec<_> = (0..FRAMES)

@@ -8,7 +8,7 @@ use crate::slam::keyframe::DepthPoint;
 /// Pixels considered to each side: depth with holes has some thirty there.
 const RADIUS: usize = 6;
 /// Fewest pixels with depth on one surface.
-const FEWEST: usize = 12;
+const MIN_NEIGHBOURS: usize = 12;
 /// Depths more than this many standard deviations apart are not on one surface.
 const TOLERANCE: f64 = 3.0;
 /// Share of the inverse depth by which exact depths of one surface differ: a surface seen at 75° over [`RADIUS`] pixels
@@ -19,7 +19,7 @@ const CORRELATED: f64 = 9.0;
 /// Largest standard deviation of a normal's direction, radians (17°): a less certain one shades a surface wrongly.
 const MAX_STD_DEV: f64 = 0.3;
 /// Smallest sine of the angle between ray and surface: a surface at a shallower angle is not seen.
-const LEAST_SINE: f64 = 0.1;
+const MIN_SINE: f64 = 0.1;
 
 /// The normal at a point of a keyframe, in the keyframe's axes, towards the camera; `None` where the depth around does
 /// not determine it. An inverse depth that is a plane over the image, d = n · ray, is a plane in space with normal n.
@@ -45,7 +45,7 @@ pub(super) fn normal(view: &View<'_>, point: &DepthPoint) -> Option<Vector3<f64>
         sum_of_squares += difference * difference;
         count += 1;
     }
-    if count < FEWEST {
+    if count < MIN_NEIGHBOURS {
         return None;
     }
     let inverse = normal.cholesky()?.inverse();
@@ -59,6 +59,6 @@ pub(super) fn normal(view: &View<'_>, point: &DepthPoint) -> Option<Vector3<f64>
     let length = n.norm();
     let spread = ((inverse[(0, 0)] + inverse[(1, 1)]) * variance).sqrt();
     let sine = offset / (length * centre.norm());
-    let is_known = length > 0.0 && spread <= MAX_STD_DEV * length && sine >= LEAST_SINE;
+    let is_known = length > 0.0 && spread <= MAX_STD_DEV * length && sine >= MIN_SINE;
     is_known.then(|| -n / length)
 }

@@ -17,7 +17,7 @@ pub(super) struct View<'a> {
 
 /// How another keyframe's depth relates to a point.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Opinion {
+pub(super) enum Verdict {
     /// The point is on the other's surface: inverse depth of that surface in the first keyframe, and its variance.
     Agrees(f64, f64),
     /// It sees through the point: the surface is behind it.
@@ -28,7 +28,7 @@ pub(super) enum Opinion {
 
 /// Maps the pixels of one keyframe to those of another: `q = A r + t d` of a ray r at depth 1 with inverse depth d.
 #[derive(Debug)]
-pub(super) struct Sight<'a> {
+pub(super) struct Projection<'a> {
     into: &'a View<'a>,
     rotation: Matrix3<f64>,
     translation: Vector3<f64>,
@@ -70,7 +70,7 @@ const AROUND: [(i32, i32); 5] = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)];
 /// Least depth in another keyframe over the depth in its own: nearer, a pixel's error is many pixels there.
 const NEAREST_RATIO: f64 = 0.1;
 
-impl<'a> Sight<'a> {
+impl<'a> Projection<'a> {
     /// The projection of the points of `from` into `into`.
     pub fn new(from: &View<'_>, into: &'a View<'a>) -> Self {
         let into_from_from =
@@ -85,12 +85,12 @@ impl<'a> Sight<'a> {
     /// The other keyframe's opinion of a point with this ray, inverse depth and variance; errors beyond `tolerance`
     /// standard deviations, and beyond a share `floor` of the distance in all, are contradictions. `None` where it has
     /// no depth that is certain enough.
-    pub fn opinion(
+    pub fn verdict(
         &self,
         ray: &Vector3<f64>,
         [d, variance]: [f64; 2],
         params: &FusionParams,
-    ) -> Option<Opinion> {
+    ) -> Option<Verdict> {
         let &FusionParams { tolerance, floor, max_relative_std_dev, .. } = params;
         let turned = self.rotation * ray;
         let q = turned + self.translation * d;
@@ -118,23 +118,23 @@ impl<'a> Sight<'a> {
                 continue;
             }
             if difference * difference <= tolerance * tolerance * spread {
-                return self.back(turned.z, e, e_variance);
+                return self.agreement_along_ray(turned.z, e, e_variance);
             }
-            let opinion = if difference > 0.0 { Opinion::SeesThrough } else { Opinion::Hides };
-            against.get_or_insert(opinion);
+            let verdict = if difference > 0.0 { Verdict::SeesThrough } else { Verdict::Hides };
+            against.get_or_insert(verdict);
         }
         against
     }
 
     /// Converts an inverse depth e of the other keyframe to one along the ray.
-    fn back(&self, turned_z: f64, e: f64, variance: f64) -> Option<Opinion> {
+    fn agreement_along_ray(&self, turned_z: f64, e: f64, variance: f64) -> Option<Verdict> {
         /// Below, the ray runs across the other's view, and its depth tells little about the point's.
-        const LEAST: f64 = 0.1;
+        const MIN_REMAINDER: f64 = 0.1;
         let rest = 1.0 - e * self.translation.z;
-        if !(rest > LEAST) {
+        if !(rest > MIN_REMAINDER) {
             return None;
         }
         let gain = turned_z / (rest * rest);
-        Some(Opinion::Agrees(e * turned_z / rest, variance * gain * gain))
+        Some(Verdict::Agrees(e * turned_z / rest, variance * gain * gain))
     }
 }

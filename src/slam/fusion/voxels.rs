@@ -5,7 +5,7 @@ use std::cmp::Ordering;
 /// Number of cell sizes per factor of two.
 const STEPS_PER_OCTAVE: f64 = 2.0;
 /// Largest index of a cell along an axis, of either sign.
-const MOST_CELLS: f64 = 1e9;
+const MAX_CELL_INDEX: f64 = 1e9;
 
 /// A cell: its size and its position.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -36,7 +36,9 @@ impl Cell {
         let level = level as i16;
         let side = side(level);
         let at = position.map(|c| (c / side).floor());
-        at.iter().all(|c| c.abs() < MOST_CELLS).then(|| Self { level, at: at.map(|c| c as i32) })
+        at.iter()
+            .all(|c| c.abs() < MAX_CELL_INDEX)
+            .then(|| Self { level, at: at.map(|c| c as i32) })
     }
 }
 

@@ -55,14 +55,15 @@ impl Sim3 {
 
     /// The rigid pose, in this similarity's target frame, of a camera at `keyframe_from_camera` (translation in
     /// keyframe units): `world_from_camera` for `world_from_keyframe`. A camera has no scale, so the result is rigid.
-    pub fn place(&self, keyframe_from_camera: &SE3) -> SE3 {
+    pub fn transform_pose(&self, keyframe_from_camera: &SE3) -> SE3 {
         let mut scaled = *keyframe_from_camera;
         scaled.translation *= self.scale;
         self.rigid * scaled
     }
 
-    /// The inverse of [`Sim3::place`]: `keyframe_from_camera`, in keyframe units, of a camera at `world_from_camera`.
-    pub fn locate(&self, world_from_camera: &SE3) -> SE3 {
+    /// The inverse of [`Sim3::transform_pose`]: `keyframe_from_camera`, in keyframe units, of a camera at
+    /// `world_from_camera`.
+    pub fn inverse_transform_pose(&self, world_from_camera: &SE3) -> SE3 {
         let mut relative = self.rigid.inverse() * *world_from_camera;
         relative.translation /= self.scale;
         relative
@@ -279,7 +280,7 @@ mod tests {
 
         #[test]
         fn locate_inverts_place(world in similarity(), camera in similarity()) {
-            let back = world.locate(&world.place(&camera.rigid));
+            let back = world.inverse_transform_pose(&world.transform_pose(&camera.rigid));
             prop_assert!((back.inverse() * camera.rigid).log().norm() < 1e-8);
         }
 
@@ -288,7 +289,7 @@ mod tests {
             // A point in keyframe units, seen by the camera, keeps its direction when both are placed in the world.
             let p = Vector3::from(p);
             let in_camera = camera.rigid.inverse() * p;
-            let in_world_camera = world.place(&camera.rigid).inverse() * (world * p);
+            let in_world_camera = world.transform_pose(&camera.rigid).inverse() * (world * p);
             prop_assert!((in_camera * world.scale - in_world_camera).norm() < 1e-7);
         }
     }

@@ -163,7 +163,7 @@ impl ConstraintSolver {
         if matches!(start, Start::Similarity(j_from_i) if !j_from_i.is_valid()) {
             return Err(Refusal::InvalidStart);
         }
-        let start = start::find(views, start, params).ok_or(Refusal::NothingAlike)?;
+        let start = start::find(views, start, params).ok_or(Refusal::NoOverlap)?;
         let (state, sums) = align::descend(views, &start, params).ok_or(Refusal::NothingInView)?;
         if (sums.compared as usize) < params.gates.min_points {
             return Err(Refusal::LittleOverlap);

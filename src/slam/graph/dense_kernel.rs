@@ -9,7 +9,7 @@ const TILE: usize = 8;
 /// Columns that are eliminated before the rest is updated: their part of a front fits the second-level cache.
 const PANEL: usize = 48;
 /// A pivot below this share of its original value is rounding error.
-const LEAST_PIVOT: f64 = 1e-13;
+const MIN_PIVOT: f64 = 1e-13;
 
 /// A pivot was not positive: its column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -92,7 +92,7 @@ fn eliminate_panel(
             }
         }
         let pivot = current[0];
-        if !(pivot > LEAST_PIVOT * least[column] && pivot.is_finite()) {
+        if !(pivot > MIN_PIVOT * least[column] && pivot.is_finite()) {
             return Err(NotPositive(column));
         }
         let inverse = 1.0 / pivot.sqrt();

@@ -12,8 +12,8 @@ const FIRST_DAMPING: f64 = 1e-5;
 const DAMPING_DOWN: f64 = 0.1;
 const DAMPING_UP: f64 = 10.0;
 /// Least damping: no effect, but the next one can grow from it; above the most every step vanishes.
-const LEAST_DAMPING: f64 = 1e-12;
-const MOST_DAMPING: f64 = 1e8;
+const MIN_DAMPING: f64 = 1e-12;
+const MAX_DAMPING: f64 = 1e8;
 /// Converged when a step would lower the cost by less than this, and by less than this share of it: a thousandth of a
 /// standard deviation in one direction lowers it by a millionth.
 const CONVERGED_DECREASE: f64 = 1e-6;
@@ -48,7 +48,7 @@ fn solve_from<const D: usize>(
     let (mut damping, mut iterations, mut is_converged) = (first_damping, 0, false);
     let (mut step, mut moved) = (Vec::new(), places.clone());
     let (mut is_linearised, mut is_near) = (false, false);
-    while iterations < params.max_iterations && damping <= MOST_DAMPING {
+    while iterations < params.max_iterations && damping <= MAX_DAMPING {
         if !is_linearised {
             system.linearise(constraints, &places);
             is_linearised = true;
@@ -62,7 +62,7 @@ fn solve_from<const D: usize>(
                 break;
             }
             damping *= DAMPING_UP;
-            if damping > MOST_DAMPING {
+            if damping > MAX_DAMPING {
                 return Err(SolveError::Singular);
             }
             continue;
@@ -73,7 +73,7 @@ fn solve_from<const D: usize>(
         if trial < current {
             std::mem::swap(&mut places, &mut moved);
             (current, is_linearised) = (trial, false);
-            damping = (damping * DAMPING_DOWN).max(LEAST_DAMPING);
+            damping = (damping * DAMPING_DOWN).max(MIN_DAMPING);
         } else {
             damping *= DAMPING_UP;
         }
@@ -151,12 +151,12 @@ mod tests {
         let information = Matrix7::identity();
         graph.add_constraint(Constraint { i, j, j_from_i, information, kernel }).unwrap();
         // So much damping that the first step promises nothing.
-        let outcome = solve_from::<7>(&mut graph, &GraphParams::default(), MOST_DAMPING).unwrap();
+        let outcome = solve_from::<7>(&mut graph, &GraphParams::default(), MAX_DAMPING).unwrap();
         assert!(outcome.is_converged && outcome.cost < 1e-12, "{outcome:?}");
         // Short of the optimum it does not report convergence.
         let mut short = graph.clone();
         short.places_mut().for_each(|place| *place = Sim3::exp(&off) * *place);
         let params = GraphParams { max_iterations: 1, ..GraphParams::default() };
-        assert!(!solve_from::<7>(&mut short, &params, MOST_DAMPING).unwrap().is_converged);
+        assert!(!solve_from::<7>(&mut short, &params, MAX_DAMPING).unwrap().is_converged);
     }
 }

@@ -9,7 +9,7 @@ use crate::slam::image::buffer::Image;
 pub const MAX_LEVELS: usize = 5;
 
 /// Contrast below which an image is blank, grey levels: covered lens, overexposure, a white wall.
-pub const LEAST_CONTRAST: f64 = 2.0;
+pub const MIN_CONTRAST: f64 = 2.0;
 
 /// Factor from a pixel of `level` to grey levels.
 pub fn grey_per_sum(level: usize) -> f32 {

@@ -16,7 +16,7 @@ pub trait Register: Copy {
     /// A truth value for each lane.
     type Mask: Copy;
     /// An i32 for each lane.
-    type Whole: Copy;
+    type IntLanes: Copy;
 
     unsafe fn splat(value: f32) -> Self;
     unsafe fn load(from: *const f32) -> Self;
@@ -39,14 +39,14 @@ pub trait Register: Copy {
     unsafe fn select(mask: Self::Mask, yes: Self, no: Self) -> Self;
     unsafe fn bits(mask: Self::Mask) -> u32;
     /// Rounds towards zero; `i32::MIN` where the result does not fit.
-    unsafe fn truncate(self) -> Self::Whole;
-    unsafe fn float(whole: Self::Whole) -> Self;
+    unsafe fn truncate(self) -> Self::IntLanes;
+    unsafe fn float(whole: Self::IntLanes) -> Self;
     /// `row * stride + column`, wrapping.
-    unsafe fn index(column: Self::Whole, row: Self::Whole, stride: i32) -> Self::Whole;
+    unsafe fn index(column: Self::IntLanes, row: Self::IntLanes, stride: i32) -> Self::IntLanes;
     /// The numbers at `index`, unsigned and clamped to `last`, and the numbers right after them.
-    unsafe fn pairs(table: &[u16], index: Self::Whole, last: u32) -> [Self; 2];
+    unsafe fn pairs(table: &[u16], index: Self::IntLanes, last: u32) -> [Self; 2];
     /// The same for bytes.
-    unsafe fn byte_pairs(table: &[u8], index: Self::Whole, last: u32) -> [Self; 2];
+    unsafe fn byte_pairs(table: &[u8], index: Self::IntLanes, last: u32) -> [Self; 2];
 }
 
 /// Defines methods of `Register` that are one intrinsic each.
@@ -74,12 +74,12 @@ pub struct Mask<R: Register>(R::Mask);
 /// A pixel type that [`Lanes::sample`] reads.
 pub trait Pixel: Sized {
     /// The numbers at `index` and those right after them; arbitrary numbers where the table does not have both.
-    fn pairs<R: Register>(table: &[Self], index: Whole<R>) -> [Lanes<R>; 2];
+    fn pairs<R: Register>(table: &[Self], index: IntLanes<R>) -> [Lanes<R>; 2];
 }
 
 /// An i32 for each lane.
 #[derive(Clone, Copy)]
-pub struct Whole<R: Register>(R::Whole);
+pub struct IntLanes<R: Register>(R::IntLanes);
 
 /// Four neighbouring pixels and the position between them.
 #[derive(Clone, Copy)]
@@ -142,7 +142,7 @@ impl<R: Register> Lanes<R> {
         /// Whether both are equal.
         equal(other) -> Mask;
         /// Rounds towards zero.
-        truncate() -> Whole;
+        truncate() -> IntLanes;
     }
 
     /// Stores the lanes; panics if `to` has fewer numbers than lanes.
@@ -166,7 +166,7 @@ impl<R: Register> Lanes<R> {
     pub fn sample<P: Pixel>(image: &[P], stride: usize, u: Self, v: Self) -> Sample<R> {
         let (column, row) = (u.truncate(), v.truncate());
         // SAFETY: whoever made the lanes vouched for the instructions.
-        let index = Whole(unsafe { R::index(column.0, row.0, stride as i32) });
+        let index = IntLanes(unsafe { R::index(column.0, row.0, stride as i32) });
         let [upper_left, upper_right] = P::pairs(&image[..image.len() - stride], index);
         let [lower_left, lower_right] = P::pairs(&image[stride..], index);
         let (du, dv) = (u - column.float(), v - row.float());
@@ -174,7 +174,7 @@ impl<R: Register> Lanes<R> {
     }
 }
 
-impl<R: Register> Whole<R> {
+impl<R: Register> IntLanes<R> {
     /// The same numbers as f32.
     #[inline(always)]
     pub fn float(self) -> Lanes<R> {
@@ -187,7 +187,7 @@ macro_rules! pixels {
     ($($Pixel:ty, $pairs:ident, $behind:literal;)*) => {$(
         impl Pixel for $Pixel {
             #[inline(always)]
-            fn pairs<R: Register>(table: &[Self], index: Whole<R>) -> [Lanes<R>; 2] {
+            fn pairs<R: Register>(table: &[Self], index: IntLanes<R>) -> [Lanes<R>; 2] {
                 // Indices must fit an i32.
                 assert!(($behind..1 << 31).contains(&table.len()), "size of a table");
                 let last = (table.len() - $behind) as u32;

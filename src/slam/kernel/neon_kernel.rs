@@ -7,7 +7,7 @@ use crate::slam::kernel::lanes_kernel::{EXPONENT, Register, intrinsics};
 impl Register for float32x4_t {
     const N: usize = 4;
     type Mask = uint32x4_t;
-    type Whole = int32x4_t;
+    type IntLanes = int32x4_t;
 
     intrinsics! {
         splat(value: f32) -> Self = vdupq_n_f32(value);

@@ -32,7 +32,7 @@ impl<const N: usize> Numbers<N> {
 impl<const N: usize> Register for Numbers<N> {
     const N: usize = N;
     type Mask = [bool; N];
-    type Whole = [i32; N];
+    type IntLanes = [i32; N];
 
     intrinsics! {
         splat(value: f32) -> Self = Self([value; N]);

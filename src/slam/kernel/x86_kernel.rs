@@ -7,7 +7,7 @@ use crate::slam::kernel::lanes_kernel::{EXPONENT, Register, intrinsics};
 impl Register for __m256 {
     const N: usize = 8;
     type Mask = __m256;
-    type Whole = __m256i;
+    type IntLanes = __m256i;
 
     intrinsics! {
         splat(value: f32) -> Self = _mm256_set1_ps(value);
@@ -60,7 +60,7 @@ impl Register for __m256 {
 impl Register for __m512 {
     const N: usize = 16;
     type Mask = __mmask16;
-    type Whole = __m512i;
+    type IntLanes = __m512i;
 
     intrinsics! {
         splat(value: f32) -> Self = _mm512_set1_ps(value);

@@ -1,9 +1,9 @@
 //! Constraints between keyframes without loops: the pose of each relative to those it was estimated with.
 //!
 //! The estimate gives the covariance P of the errors (ξ, λ) of a pose relative to those held
-//! (`slam::place_covariance`). With S = `map_from_keyframe` of the newer keyframe the error of the left increment of
-//! `newer_from_older` is −Ad(S⁻¹) (ξ, 0) − (0, 0, λ). The n links of a keyframe together carry the information of its
-//! estimate, so each has n times the covariance.
+//! (`slam::keyframe_pose_covariance`). With S = `map_from_keyframe` of the newer keyframe the error of the left
+//! increment of `newer_from_older` is −Ad(S⁻¹) (ξ, 0) − (0, 0, λ). The n links of a keyframe together carry the
+//! information of its estimate, so each has n times the covariance.
 
 use std::collections::BTreeMap;
 
@@ -13,14 +13,14 @@ use crate::slam::graph::pose_graph::{Constraint, PoseGraph, VertexId};
 use crate::slam::graph::robust::RobustKernel;
 use crate::slam::graph::{GraphParams, normalized_errors};
 use crate::slam::keyframe::Keyframe;
+use crate::slam::keyframe_pose_covariance::KeyframePoseCovariance;
 use crate::slam::loops::Loops;
-use crate::slam::loops::known::Link;
-use crate::slam::place_covariance::PlaceCovariance;
+use crate::slam::loops::record::Link;
 
 /// Standard deviations of a link (translation in mean depths, rotation in radians, ln s): the least, whatever an
 /// estimate claims, and those without an estimate. The least are an eighth of a pixel at f = 250 and the uncertainty of
 /// a scale that a thousand points hold; the others those of a step to the next keyframe by the tracker alone.
-const LEAST: [f64; 3] = [0.0005, 0.0005, 0.001];
+const MIN_STD_DEVS: [f64; 3] = [0.0005, 0.0005, 0.001];
 const UNESTIMATED: [f64; 3] = [0.03, 0.02, 0.05];
 
 /// The pose graph of an epoch.
@@ -51,10 +51,10 @@ impl Chain {
                 let at = of_epoch[..place].binary_search_by_key(id, |node| node.keyframe_id);
                 of_epoch.get(at.ok()?)
             };
-            let known = loops.known.held_by.get(&node.keyframe_id).into_iter().flatten();
+            let known = loops.record.held_by.get(&node.keyframe_id).into_iter().flatten();
             let mut others: Vec<&Keyframe> = known.filter_map(of).copied().collect();
             let is_estimated = !others.is_empty();
-            if !is_estimated && !loops.known.beginnings.contains(&node.keyframe_id) {
+            if !is_estimated && !loops.record.beginnings.contains(&node.keyframe_id) {
                 others.push(of_epoch[place - 1]);
             }
             let covariance = link_covariance(
@@ -68,7 +68,7 @@ impl Chain {
                 chain.num_links += 1;
             }
         }
-        for link in &loops.known.links {
+        for link in &loops.record.links {
             chain.add_loop(link);
         }
         Some(chain)
@@ -118,7 +118,7 @@ impl Predictions {
 /// Covariance of the left increment of `newer_from_older` from that of the newer one's pose.
 pub(super) fn link_covariance(
     map_from_newer: &Sim3,
-    place: Option<&PlaceCovariance>,
+    place: Option<&KeyframePoseCovariance>,
     inflation: f64,
 ) -> Matrix7 {
     let of_deviations = |[translation, rotation, scale]: [f64; 3]| {
@@ -131,5 +131,5 @@ pub(super) fn link_covariance(
     by_errors.fixed_view_mut::<7, 1>(0, 6).fill(0.0);
     by_errors[(6, 6)] = 1.0;
     let covariance = by_errors * place.matrix() * by_errors.transpose() * inflation;
-    covariance + of_deviations(LEAST)
+    covariance + of_deviations(MIN_STD_DEVS)
 }

@@ -6,9 +6,9 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::{GraphParams, optimise};
 use crate::slam::keyframe::Keyframe;
 use crate::slam::loops::chain::Chain;
-use crate::slam::loops::known::Link;
+use crate::slam::loops::record::Link;
 use crate::slam::loops::search::LARGEST_CHI2;
-use crate::slam::loops::{Job, Loops, SearchFate};
+use crate::slam::loops::{Job, Loops, SearchOutcome};
 use crate::slam::map::EpochJoin;
 
 /// The change of the map by a loop.
@@ -35,23 +35,23 @@ impl Closure {
 
 impl Loops {
     /// Adds a confirmed loop as a constraint, unless it contradicts the earlier ones.
-    pub(super) fn close(&mut self, job: &Job, confirmed: &[Link]) -> SearchFate {
-        let before = self.known.links.len();
-        Arc::make_mut(&mut self.known).links.extend(confirmed);
-        let fate = self.solve(job, confirmed.len());
-        if fate == SearchFate::Inconsistent {
-            Arc::make_mut(&mut self.known).links.truncate(before);
+    pub(super) fn close(&mut self, job: &Job, confirmed: &[Link]) -> SearchOutcome {
+        let before = self.record.links.len();
+        Arc::make_mut(&mut self.record).links.extend(confirmed);
+        let outcome = self.solve(job, confirmed.len());
+        if outcome == SearchOutcome::Inconsistent {
+            Arc::make_mut(&mut self.record).links.truncate(before);
         }
-        fate
+        outcome
     }
 
     /// Solves for the effect of the newest loops on the map: a pair, or those that join two epochs.
-    pub(super) fn solve(&mut self, job: &Job, num_newest: usize) -> SearchFate {
-        let links = &self.known.links;
+    pub(super) fn solve(&mut self, job: &Job, num_newest: usize) -> SearchOutcome {
+        let links = &self.record.links;
         let first = links.len().checked_sub(num_newest).and_then(|at| links.get(at));
-        let Some(first) = first.copied() else { return SearchFate::Inconsistent };
+        let Some(first) = first.copied() else { return SearchOutcome::Inconsistent };
         let (Some(i), Some(j)) = (job.node(first.i), job.node(first.j)) else {
-            return SearchFate::Inconsistent;
+            return SearchOutcome::Inconsistent;
         };
         match i.epoch == j.epoch {
             true => self.solve_graph(job, i.epoch, num_newest),
@@ -59,7 +59,7 @@ impl Loops {
         }
     }
 
-    fn join(&mut self, job: &Job, link: &Link, [i, j]: [&Keyframe; 2]) -> SearchFate {
+    fn join(&mut self, job: &Job, link: &Link, [i, j]: [&Keyframe; 2]) -> SearchOutcome {
         let is_newer = i.epoch > j.epoch;
         let (newer, older) = if is_newer { (i, j) } else { (j, i) };
         let j_from_i = link.j_from_i;
@@ -68,33 +68,33 @@ impl Loops {
             older.map_from_keyframe * older_from_newer * newer.map_from_keyframe.inverse();
         let (epoch, into) = (newer.epoch, older.epoch);
         let beginning = job.nodes.iter().find(|node| node.epoch == epoch);
-        Arc::make_mut(&mut self.known).beginnings.extend(beginning.map(|node| node.keyframe_id));
+        Arc::make_mut(&mut self.record).beginnings.extend(beginning.map(|node| node.keyframe_id));
         let join = Some(EpochJoin { epoch, into, into_from_epoch });
         self.closure = Some(Closure { epoch, moves: Vec::new(), join });
-        SearchFate::Joined
+        SearchOutcome::Joined
     }
 
-    fn solve_graph(&mut self, job: &Job, epoch: u32, num_newest: usize) -> SearchFate {
+    fn solve_graph(&mut self, job: &Job, epoch: u32, num_newest: usize) -> SearchOutcome {
         /// χ²₇ that one of ten thousand true loops exceeds: together with the other constraints one must be false.
         const CONTRADICTED_CHI2: f64 = 29.9;
         let Some(mut chain) = Chain::new(self, &job.nodes, epoch) else {
-            return SearchFate::Inconsistent;
+            return SearchOutcome::Inconsistent;
         };
         let errors = chain.loop_errors();
         if errors.iter().rev().take(num_newest).all(|&error| error <= LARGEST_CHI2) {
-            return SearchFate::Held;
+            return SearchOutcome::AlreadyConsistent;
         }
         let before: Vec<Sim3> =
             chain.graph.vertices().iter().map(|v| v.map_from_keyframe).collect();
         let solved = optimise(&mut chain.graph, &GraphParams::default());
         let is_solved = solved.is_ok_and(|outcome| outcome.is_converged);
         if !is_solved || !chain.loop_errors().iter().all(|&error| error <= CONTRADICTED_CHI2) {
-            return SearchFate::Inconsistent;
+            return SearchOutcome::Inconsistent;
         }
         let after = chain.graph.vertices().iter().map(|v| v.map_from_keyframe);
         let by = after.zip(before).map(|(is, was)| is * was.inverse());
         let moves = chain.ids.iter().copied().zip(by).collect();
         self.closure = Some(Closure { epoch, moves, join: None });
-        SearchFate::Closed
+        SearchOutcome::Closed
     }
 }

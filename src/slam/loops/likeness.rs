@@ -8,7 +8,7 @@ use crate::slam::places::{Description, PlaceCandidate, PlaceIndex};
 
 /// Appearance of the keyframes.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Likeness {
+pub(super) struct AppearanceIndex {
     index: PlaceIndex,
     /// The newest one offered.
     offered_to: Option<u64>,
@@ -18,7 +18,7 @@ pub(super) struct Likeness {
     waiting: BTreeMap<u64, Arc<Description>>,
 }
 
-impl Likeness {
+impl AppearanceIndex {
     /// Takes the descriptions of new keyframes; one whose image is too small has none. Returns the index of the first
     /// new one.
     pub(super) fn offer(&mut self, keyframes: &[Keyframe]) -> usize {
@@ -90,7 +90,7 @@ mod tests {
     fn a_view_is_found_with_its_rotation() {
         let scene = Scene::new(3);
         let pixels = |pose: &SE3| scene.render(&CAMERA, pose).noisy(2.0, 1);
-        let mut likeness = Likeness::default();
+        let mut likeness = AppearanceIndex::default();
         let turned = SE3::exp(&Vector6::new(0.05, 0.0, 0.0, 0.06, -0.15, 0.4));
         let away = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 2.6, 0.0));
         for (id, pose) in [(1, SE3::identity()), (5, away), (9, turned)] {

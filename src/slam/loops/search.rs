@@ -4,20 +4,20 @@
 use crate::slam::geometry::sim3::{Matrix7, Sim3, Twist7};
 use crate::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Refusal, Start};
 use crate::slam::loops::chain::{Chain, link_covariance};
-use crate::slam::loops::known::Link;
-use crate::slam::loops::{Job, Loops, Pair, Plan, SearchFate, Stage, confirmations};
+use crate::slam::loops::record::Link;
+use crate::slam::loops::{Job, Loops, Pair, Plan, SearchOutcome, Stage, confirmations};
 
 /// χ²₇ at 99 %, up to which two measurements agree.
 pub(super) const LARGEST_CHI2: f64 = 18.5;
 
 impl Loops {
     /// Measures the candidates of a keyframe, and plans the confirmation of the first plausible one.
-    pub(super) fn search(&mut self, job: &Job) -> (u32, SearchFate) {
+    pub(super) fn search(&mut self, job: &Job) -> (u32, SearchOutcome) {
         let solver = ConstraintSolver::new(ConstraintParams::default());
         let mut refusal = None;
         let (mut compared, mut against_drift) = (0, None);
         let (Some(of), Some(node)) = (job.keyframe(job.plan.of), job.node(job.plan.of)) else {
-            return (0, SearchFate::Refused(Refusal::TooFewPoints));
+            return (0, SearchOutcome::Refused(Refusal::TooFewPoints));
         };
         let chain = Chain::new(self, &job.nodes, node.epoch);
         let mut predictions = chain.and_then(Chain::into_predictions);
@@ -32,7 +32,7 @@ impl Loops {
             let predicted = predicted.filter(|_| is_one_epoch);
             let least = predicted.as_ref().map_or(0.0, |(at, by)| least_chi2(at, by));
             if least > LARGEST_CHI2 {
-                against_drift.get_or_insert(SearchFate::AgainstDrift(least));
+                against_drift.get_or_insert(SearchOutcome::AgainstDrift(least));
                 continue;
             }
             compared += 1;
@@ -53,23 +53,23 @@ impl Loops {
                 None => 0.0,
             };
             if !(chi2 <= LARGEST_CHI2) {
-                against_drift.get_or_insert(SearchFate::AgainstDrift(chi2));
+                against_drift.get_or_insert(SearchOutcome::AgainstDrift(chi2));
                 continue;
             }
             let pairs = confirming(job, &link);
             let (of, likeness) = (pair.i, job.plan.likeness);
             self.plan = Some(Plan { of, stage: Stage::Confirm(Box::new(link)), pairs, likeness });
-            return (compared, SearchFate::Proposed);
+            return (compared, SearchOutcome::Proposed);
         }
-        let refused = SearchFate::Refused(refusal.unwrap_or(Refusal::NothingAlike));
+        let refused = SearchOutcome::Refused(refusal.unwrap_or(Refusal::NoOverlap));
         (compared, against_drift.unwrap_or(refused))
     }
 
     /// Measures pairs next to a loop; one must confirm it, two for a loop between epochs.
-    pub(super) fn confirm(&mut self, job: &Job, link: &Link) -> (u32, SearchFate) {
+    pub(super) fn confirm(&mut self, job: &Job, link: &Link) -> (u32, SearchOutcome) {
         let solver = ConstraintSolver::new(ConstraintParams::default());
         let (Some(i), Some(j)) = (job.node(link.i), job.node(link.j)) else {
-            return (0, SearchFate::Unconfirmed);
+            return (0, SearchOutcome::Unconfirmed);
         };
         let wanted = confirmations(i.epoch == j.epoch);
         let mut compared = 0;
@@ -91,7 +91,7 @@ impl Loops {
                 return (compared, self.close(job, &confirmations));
             }
         }
-        (compared, SearchFate::Unconfirmed)
+        (compared, SearchOutcome::Unconfirmed)
     }
 
     /// Whether two neighbouring pairs agree about the map.

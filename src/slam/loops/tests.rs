@@ -4,9 +4,9 @@ use super::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Twist7;
 use crate::slam::graph::constraint::tests::{DepthError, USUAL, keyframe};
+use crate::slam::keyframe_pose_covariance::{KeyframePoseCovariance, KeyframePoseMatrix};
 use crate::slam::loops::chain::Chain;
 use crate::slam::map::Correction;
-use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
 use crate::slam::places::Describer;
 use crate::slam::test_scene::{Random, Scene};
 use nalgebra::Vector6;
@@ -50,7 +50,7 @@ impl Course {
             let variance = if id == 0 { 0.0 } else { claimed * claimed };
             // Rotation errors of a step are about the keyframe; as left increments of the map, about its origin.
             let about = SE3 { translation: at, ..SE3::identity() }.adjoint();
-            let mut covariance = PlaceMatrix::identity() * variance;
+            let mut covariance = KeyframePoseMatrix::identity() * variance;
             let of_pose = about * about.transpose() * variance;
             covariance.fixed_view_mut::<6, 6>(0, 0).copy_from(&of_pose);
             if id > 0 {
@@ -62,7 +62,7 @@ impl Course {
             let keyframe = Keyframe {
                 keyframe_id: id,
                 map_from_keyframe: error * Sim3::new(place, image.map_from_keyframe.scale),
-                place_covariance: PlaceCovariance::bounded(&covariance),
+                place_covariance: KeyframePoseCovariance::bounded(&covariance),
                 ..image
             };
             let Intrinsics { width, height, .. } = keyframe.intrinsics;
@@ -115,13 +115,16 @@ fn views(scene: &Scene, places: &[SE3]) -> Vec<(Keyframe, SE3)> {
     (0u64..).zip(places).map(view).collect()
 }
 
-fn count(reports: &[SearchReport], is: impl Fn(&SearchFate) -> bool) -> usize {
-    reports.iter().filter(|report| is(&report.fate)).count()
+fn count(reports: &[SearchReport], is: impl Fn(&SearchOutcome) -> bool) -> usize {
+    reports.iter().filter(|report| is(&report.outcome)).count()
 }
 
 fn moves_nothing(reports: &[SearchReport]) -> bool {
-    count(reports, |fate| {
-        matches!(fate, SearchFate::Closed | SearchFate::Held | SearchFate::Joined)
+    count(reports, |outcome| {
+        matches!(
+            outcome,
+            SearchOutcome::Closed | SearchOutcome::AlreadyConsistent | SearchOutcome::Joined
+        )
     }) == 0
 }
 
@@ -132,7 +135,7 @@ fn a_loop_removes_the_drift_from_the_map() {
         let mut course = Course::of(&Scene::new(seed), &places, 0.02, 1.0, seed);
         let before = course.error(13, &places);
         let reports = course.run();
-        assert!(count(&reports, |fate| *fate == SearchFate::Closed) > 0, "{reports:?}");
+        assert!(count(&reports, |outcome| *outcome == SearchOutcome::Closed) > 0, "{reports:?}");
         let after = course.error(13, &places);
         assert!(after < 0.05 && after < 0.5 * before, "{seed}: {before} {after} {reports:?}");
         // Far from both ends at most half of it is gone, and nothing is torn.
@@ -149,8 +152,11 @@ fn a_map_that_agrees_with_its_loop_stays_unchanged() {
     let mut course = Course::of(&Scene::new(1), &places, 0.02, 0.0, 0);
     let before: Vec<Sim3> = course.map.keyframes.iter().map(|k| k.map_from_keyframe).collect();
     let reports = course.run();
-    assert!(count(&reports, |fate| *fate == SearchFate::Held) > 0, "{reports:?}");
-    assert_eq!(count(&reports, |fate| *fate == SearchFate::Closed), 0, "{reports:?}");
+    assert!(
+        count(&reports, |outcome| *outcome == SearchOutcome::AlreadyConsistent) > 0,
+        "{reports:?}"
+    );
+    assert_eq!(count(&reports, |outcome| *outcome == SearchOutcome::Closed), 0, "{reports:?}");
     let after: Vec<Sim3> = course.map.keyframes.iter().map(|k| k.map_from_keyframe).collect();
     assert_eq!(before, after);
 }
@@ -163,7 +169,10 @@ fn an_identical_room_is_a_different_one_if_the_map_cannot_have_drifted_so_far() 
     let mut course = Course::new(views, 0.02, 1.0, 4);
     let reports = course.run();
     assert!(moves_nothing(&reports), "{reports:?}");
-    assert!(count(&reports, |fate| matches!(fate, SearchFate::AgainstDrift(_))) > 0, "{reports:?}");
+    assert!(
+        count(&reports, |outcome| matches!(outcome, SearchOutcome::AgainstDrift(_))) > 0,
+        "{reports:?}"
+    );
 }
 
 #[test]
@@ -180,7 +189,7 @@ fn a_view_that_its_neighbours_contradict_is_rejected() {
     let mut course = Course::new(views, 0.05, 0.3, 5);
     let reports = course.run();
     assert!(moves_nothing(&reports), "{reports:?}");
-    assert!(count(&reports, |fate| *fate == SearchFate::Unconfirmed) > 0, "{reports:?}");
+    assert!(count(&reports, |outcome| *outcome == SearchOutcome::Unconfirmed) > 0, "{reports:?}");
 }
 
 #[test]
@@ -223,7 +232,7 @@ fn two_epochs_that_see_the_same_become_one() {
     let mut course = Course::new(views, 0.01, 0.0, 8);
     let into_epoch = Sim3::new(origin, 2.5);
     let reports = course.run();
-    assert_eq!(count(&reports, |fate| *fate == SearchFate::Joined), 1, "{reports:?}");
+    assert_eq!(count(&reports, |outcome| *outcome == SearchOutcome::Joined), 1, "{reports:?}");
     assert!(course.map.keyframes.iter().all(|keyframe| keyframe.epoch == 0));
     let last = &course.map.keyframes[course.map.keyframes.len() - 1].map_from_keyframe;
     let truth = places[4];
@@ -236,7 +245,7 @@ fn a_search_that_continues_from_stored_loops_has_the_same_pose_graph() {
     let places = round();
     let mut course = Course::of(&Scene::new(0), &places, 0.02, 1.0, 0);
     course.run();
-    let kept = course.loops.known().clone();
+    let kept = course.loops.record().clone();
     assert!(!kept.links.is_empty() && kept.held_by.len() == 14, "{kept:?}");
     let keyframes = &course.map.keyframes;
     let nodes: Vec<Keyframe> = keyframes.iter().map(Keyframe::without_depth).collect();
@@ -245,10 +254,10 @@ fn a_search_that_continues_from_stored_loops_has_the_same_pose_graph() {
     };
     let fresh = || Loops::new(course.loops.intrinsics, course.loops.params.clone());
     let mut resumed = fresh();
-    resumed.take_up(kept.clone(), keyframes);
+    resumed.resume_from(kept.clone(), keyframes);
     assert_eq!(predicted(&resumed), predicted(&course.loops));
     assert_ne!(predicted(&resumed), predicted(&fresh()));
-    assert_eq!(resumed.known(), &kept);
+    assert_eq!(resumed.record(), &kept);
     // Searched keyframes are not searched again, but can be found.
     let known: Vec<u64> = (0..15).collect();
     resumed.offer(keyframes);
@@ -256,8 +265,8 @@ fn a_search_that_continues_from_stored_loops_has_the_same_pose_graph() {
     assert!(!resumed.begin(&course.map));
     // Keyframes without a record of what they were estimated with are not searched.
     let mut lost = fresh();
-    lost.take_up(Arc::default(), keyframes);
-    assert_eq!(lost.known().searched_to, Some(14));
+    lost.resume_from(Arc::default(), keyframes);
+    assert_eq!(lost.record().searched_to, Some(14));
 }
 
 #[test]

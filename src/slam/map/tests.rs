@@ -4,7 +4,7 @@ use nalgebra::Vector6;
 
 use super::*;
 use crate::slam::keyframe::MAX_KEYFRAME_POINTS;
-use crate::slam::place_covariance::PlaceMatrix;
+use crate::slam::keyframe_pose_covariance::KeyframePoseMatrix;
 
 fn keyframe(keyframe_id: u64) -> Keyframe {
     Keyframe {
@@ -44,8 +44,9 @@ fn the_oldest_lose_their_depth_and_keep_their_pose() {
 #[test]
 fn the_covariance_of_a_pose_moves_with_it_unless_a_correction_gives_one() {
     let deviations = Vector6::new(0.1, 0.2, 0.3, 0.01, 0.02, 0.03).push(0.05);
-    let matrix = PlaceMatrix::from_diagonal(&deviations.component_mul(&deviations));
-    let uncertain = Keyframe { place_covariance: PlaceCovariance::bounded(&matrix), ..keyframe(1) };
+    let matrix = KeyframePoseMatrix::from_diagonal(&deviations.component_mul(&deviations));
+    let uncertain =
+        Keyframe { place_covariance: KeyframePoseCovariance::bounded(&matrix), ..keyframe(1) };
     let by = Sim3::new(SE3::exp(&Vector6::new(1.0, -2.0, 0.5, 0.3, 0.2, -0.4)), 2.5);
     let corrected = |place, unit| {
         let mut map = Map { keyframes: vec![uncertain.clone()], ..Map::default() };
@@ -73,6 +74,6 @@ fn the_covariance_of_a_pose_moves_with_it_unless_a_correction_gives_one() {
     let longer = corrected(None, None).matrix();
     let rigid = uncertain.place_covariance.transported(&Sim3::new(by.rigid, 1.0)).matrix();
     assert!((longer - rigid).norm() < 1e-9, "{longer}");
-    let said = PlaceCovariance::bounded(&(matrix * 0.5));
+    let said = KeyframePoseCovariance::bounded(&(matrix * 0.5));
     assert_eq!(corrected(Some(said), None), said);
 }

@@ -13,7 +13,7 @@ impl Mapper {
     /// Replaces `before`, a mapper of the same camera; this mapper must have started in a map that holds none of the
     /// numbers that `before` has assigned. Keyframes mapped before keep only their poses, which place their frames: the
     /// camera is not searched for there. Odometry continues from its pose of the camera.
-    pub fn take_the_place_of(&mut self, before: Self) {
+    pub fn replace_mapper(&mut self, before: Self) {
         let mut keyframes: Vec<Keyframe> =
             before.map.keyframes.iter().map(Keyframe::without_depth).collect();
         keyframes.append(&mut self.map.keyframes);

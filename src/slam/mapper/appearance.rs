@@ -86,7 +86,7 @@ fn blurred(greys: &[f32]) -> Vec<f32> {
 /// Correlation of greys of mean 0 and this variance with rows of another image; −1 where either has no contrast.
 fn correlation<'a>(centred: &[f32], variance: f32, rows: impl Iterator<Item = &'a [f32]>) -> f32 {
     /// Variance, grey levels², up to which an image has too little contrast to compare.
-    const LEAST_VARIANCE: f32 = 1.0;
+    const MIN_VARIANCE: f32 = 1.0;
     let [mut sum, mut squares, mut common] = [0.0f32; 3];
     for (ours, theirs) in centred.chunks_exact(INNER[0]).zip(rows) {
         for (a, b) in ours.iter().zip(theirs) {
@@ -96,7 +96,7 @@ fn correlation<'a>(centred: &[f32], variance: f32, rows: impl Iterator<Item = &'
         }
     }
     let variance_of_other = squares / COUNT - (sum / COUNT) * (sum / COUNT);
-    match variance.min(variance_of_other) > LEAST_VARIANCE {
+    match variance.min(variance_of_other) > MIN_VARIANCE {
         true => common / COUNT / (variance * variance_of_other).sqrt(),
         false => -1.0,
     }

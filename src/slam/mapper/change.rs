@@ -10,13 +10,13 @@ use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::keyframe_pose_covariance::UncertainPose;
 use crate::slam::mapper::consistency::judge_change;
 use crate::slam::mapper::depth_buffers::write_depth;
-use crate::slam::mapper::finder::MOST_LEARNT;
+use crate::slam::mapper::finder::MAX_INDEXED;
 use crate::slam::mapper::modes::in_unit;
 use crate::slam::mapper::start::take_sensor_depth;
 use crate::slam::mapper::{Mapper, StepInput, StepOutcome};
-use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::{Brightness, PoseEstimate, full_covariance};
 
 /// Work left on a new keyframe after it is published.
@@ -43,22 +43,22 @@ impl Mapper {
         let (Some(active), Some(before)) = (self.active, self.keyframe()) else { return };
         let (epoch, map_from_before) = (before.epoch, before.map_from_keyframe);
         let place_covariance = before
-            .uncertain_place()
+            .uncertain_pose()
             .of_next(&pose.keyframe_from_camera, &full_covariance(&pose.covariance));
         let before_id = before.keyframe_id;
-        self.depth.leave_points(before_id, &self.params);
+        self.depth.keep_mature_points(before_id, &self.params);
         if self.depth.unpublished > 0 {
             self.depth.refine(&self.params);
         }
         let (unit, is_unit_open) = (self.depth.unit, self.depth.is_unit_open);
         let frame_from_before = in_unit(&pose.keyframe_from_camera, unit);
-        self.modes.carry(&frame_from_before, &self.intrinsics, &self.params.modes);
+        self.modes.propagate_modes(&frame_from_before, &self.intrinsics, &self.params.modes);
         self.depth.swap();
         self.depth.restart(frame.pixels, &self.params);
         let (brightness, propagation) = (pose.brightness, &self.params.propagation);
-        self.depth.carry(&frame_from_before, brightness, &self.intrinsics, propagation);
+        self.depth.propagate_spare(&frame_from_before, brightness, &self.intrinsics, propagation);
         self.past.rebase(brightness);
-        let map_from_frame = map_from_before.place(&pose.keyframe_from_camera);
+        let map_from_frame = map_from_before.transform_pose(&pose.keyframe_from_camera);
         let carried_unit = map_from_before.scale * unit;
         if let Some(sensor) = sensor_depth {
             take_sensor_depth(&mut self.depth.active, sensor, carried_unit);
@@ -76,7 +76,7 @@ impl Mapper {
             has_new_pixels: sensor_depth.is_none(),
             line_noise_px: self.matching_at(pose).line_noise_px,
         });
-        let place = UncertainPlace {
+        let place = UncertainPose {
             map_from_keyframe: Sim3::new(map_from_frame, carried_unit * factor),
             covariance: place_covariance,
         };
@@ -85,30 +85,31 @@ impl Mapper {
 
     /// Whether a keyframe made of `frame` would keep almost none of the depth because the camera has turned away from
     /// it. Frames are then tracked on the active keyframe for as long as they see it.
-    pub(super) fn leaves_depth_behind(
-        &mut self,
-        frame: &FrameView<'_>,
-        pose: &PoseEstimate,
-    ) -> bool {
+    pub(super) fn would_lose_depth(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) -> bool {
         /// Points needed to continue tracking on a keyframe: as many as a start needs.
-        const FEWEST: usize = 200;
+        const MIN_KEPT: usize = 200;
         /// With this many of the keyframe's points in view, no closer check is needed.
         const ENOUGH_IN_VIEW: f64 = 4000.0;
         let is_exact = pose.alignment_covariance.iter().all(|entry| *entry == 0.0);
         let known = self.depth.active.num_hypotheses();
         let in_view = pose.quality.in_view_ratio * known as f64;
-        if is_exact || known < FEWEST || in_view >= ENOUGH_IN_VIEW {
+        if is_exact || known < MIN_KEPT || in_view >= ENOUGH_IN_VIEW {
             return false;
         }
         let frame_from_before = in_unit(&pose.keyframe_from_camera, self.depth.unit);
         let (min_gradient, most) = (self.params.min_gradient, self.params.max_candidates);
         self.depth.swap();
-        self.depth.active.show(frame.pixels, min_gradient, most);
+        self.depth.active.restart_without_structure(frame.pixels, min_gradient, most);
         let propagation = &self.params.propagation;
-        self.depth.carry(&frame_from_before, pose.brightness, &self.intrinsics, propagation);
+        self.depth.propagate_spare(
+            &frame_from_before,
+            pose.brightness,
+            &self.intrinsics,
+            propagation,
+        );
         let carried = self.depth.active.num_hypotheses();
         self.depth.swap();
-        carried < FEWEST.max((self.params.consistency.min_kept_ratio * known as f64) as usize)
+        carried < MIN_KEPT.max((self.params.consistency.min_kept_ratio * known as f64) as usize)
     }
 
     /// Finishes a new keyframe after it is published: writes the final depth of the previous one into the map, gives
@@ -159,10 +160,11 @@ impl Mapper {
                 break;
             }
             let tracked_on = (past.keyframe_id, &past.keyframe_from_camera);
-            let Some(map_from_camera) = self.map.place(tracked_on.0, tracked_on.1) else {
+            let Some(map_from_camera) = self.map.frame_pose(tracked_on.0, tracked_on.1) else {
                 continue;
             };
-            let mut keyframe_from_camera = map_from_keyframe.locate(&map_from_camera);
+            let mut keyframe_from_camera =
+                map_from_keyframe.inverse_transform_pose(&map_from_camera);
             keyframe_from_camera.translation /= self.depth.unit;
             let baseline = keyframe_from_camera.translation.norm();
             if baseline < least {
@@ -186,10 +188,10 @@ impl Mapper {
     pub(super) fn add_keyframe(
         &mut self,
         frame: &FrameView<'_>,
-        place: &UncertainPlace,
+        place: &UncertainPose,
         epoch: u32,
     ) {
-        let UncertainPlace { map_from_keyframe, covariance: place_covariance } = *place;
+        let UncertainPose { map_from_keyframe, covariance: place_covariance } = *place;
         let (keyframe_id, image) = (self.next_keyframe_id, self.copies.of(frame));
         self.map.keyframes.push(Keyframe {
             keyframe_id,
@@ -209,11 +211,11 @@ impl Mapper {
             points: Vec::new(),
             description: None,
         });
-        self.finder.learn(&mut self.map.keyframes, MOST_LEARNT);
+        self.finder.index_new(&mut self.map.keyframes, MAX_INDEXED);
         self.map.forget_depth_beyond(self.params.max_map_bytes());
         self.next_keyframe_id += 1;
         self.past.push(image, keyframe_id, SE3::identity(), Brightness::default());
-        self.enter_keyframe(self.map.keyframes.len() - 1);
+        self.activate_keyframe(self.map.keyframes.len() - 1);
     }
 }
 
@@ -222,10 +224,10 @@ mod tests {
     use super::*;
     use crate::slam::image::buffer::Image;
     use crate::slam::keyframe::DepthPoint;
+    use crate::slam::keyframe_pose_covariance::KeyframePoseCovariance;
     use crate::slam::mapper::MapperParams;
     use crate::slam::mapper::depth_buffers::DepthBuffers;
     use crate::slam::mapper::reuse::ReuseParams;
-    use crate::slam::place_covariance::PlaceCovariance;
     use crate::slam::pose::TrackingState;
     use crate::slam::test_scene::{CAMERA, Scene};
 
@@ -258,9 +260,9 @@ mod tests {
                 state: TrackingState::Tracking,
                 keyframe_id: mapper.keyframe().map_or(u64::MAX, |k| k.keyframe_id),
                 world_from_camera,
-                keyframe_from_camera: mapper
-                    .keyframe()
-                    .map_or(SE3::identity(), |k| k.world_from_keyframe.locate(&world_from_camera)),
+                keyframe_from_camera: mapper.keyframe().map_or(SE3::identity(), |k| {
+                    k.world_from_keyframe.inverse_transform_pose(&world_from_camera)
+                }),
                 proposes_keyframe: k == 4,
                 ..PoseEstimate::unknown(&frame)
             };
@@ -318,9 +320,9 @@ mod tests {
                 state: TrackingState::Tracking,
                 keyframe_id: mapper.keyframe().map_or(u64::MAX, |k| k.keyframe_id),
                 world_from_camera,
-                keyframe_from_camera: mapper
-                    .keyframe()
-                    .map_or(SE3::identity(), |k| k.world_from_keyframe.locate(&world_from_camera)),
+                keyframe_from_camera: mapper.keyframe().map_or(SE3::identity(), |k| {
+                    k.world_from_keyframe.inverse_transform_pose(&world_from_camera)
+                }),
                 brightness: told,
                 proposes_keyframe: true,
                 ..PoseEstimate::unknown(&frame)
@@ -368,7 +370,7 @@ mod tests {
         // The frame sees nothing of the keyframe, and its pose is not a given one.
         let pose =
             PoseEstimate { alignment_covariance: [1e-6; 21], ..PoseEstimate::unknown(&frame) };
-        mapper.leaves_depth_behind(&frame, &pose);
+        mapper.would_lose_depth(&frame, &pose);
         let DepthBuffers { active, spare, .. } = &mapper.depth;
         assert!(spare.image.intensity.pixels() == pixels && spare.structure.pixels().is_empty());
         assert!(active.image.intensity == before.image.intensity);
@@ -403,13 +405,14 @@ mod tests {
                 proposes_keyframe: true,
                 ..PoseEstimate::unknown(&frame)
             };
-            let mut expected = PlaceCovariance::ZERO;
+            let mut expected = KeyframePoseCovariance::ZERO;
             if let Some(keyframe) = mapper.keyframe() {
                 pose.keyframe_id = keyframe.keyframe_id;
-                pose.keyframe_from_camera = keyframe.world_from_keyframe.locate(&world_from_camera);
+                pose.keyframe_from_camera =
+                    keyframe.world_from_keyframe.inverse_transform_pose(&world_from_camera);
                 (pose.covariance[0], pose.covariance[20]) = (1e-4, 1e-6);
                 let covariance = full_covariance(&pose.covariance);
-                let place = keyframe.uncertain_place();
+                let place = keyframe.uncertain_pose();
                 expected = place.of_next(&pose.keyframe_from_camera, &covariance);
             }
             mapper.step(&frame, &pose, Some(&depth), &mut || {});

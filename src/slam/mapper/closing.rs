@@ -22,21 +22,21 @@ impl Mapper {
     }
 
     /// The map comes from an earlier mapper: index its keyframes so that their places can be recognised.
-    pub(super) fn take_over(&mut self) {
-        self.finder.learn(&mut self.map.keyframes, usize::MAX);
-        self.take_up_loops();
+    pub(super) fn index_map(&mut self) {
+        self.finder.index_new(&mut self.map.keyframes, usize::MAX);
+        self.resume_loops();
     }
 
     /// Continues the search for loops from those stored in the map.
-    pub(super) fn take_up_loops(&mut self) {
+    pub(super) fn resume_loops(&mut self) {
         if let Some(window) = &mut self.window {
-            window.loops.take_up(Arc::clone(&self.map.loops), &self.map.keyframes);
+            window.loops.resume_from(Arc::clone(&self.map.loops), &self.map.keyframes);
         }
     }
 
     /// Takes the window back after an estimate or a search and hands its loops to the map.
-    pub(super) fn put_back(&mut self, window: Box<Window>) {
-        self.map.loops = Arc::clone(window.loops.known());
+    pub(super) fn return_window(&mut self, window: Box<Window>) {
+        self.map.loops = Arc::clone(window.loops.record());
         self.window = Some(window);
     }
 
@@ -48,7 +48,7 @@ impl Mapper {
             let by = closure.of(keyframe.keyframe_id, keyframe.epoch)?;
             Some(KeyframeCorrection {
                 place: Some(keyframe.place_covariance.transported(by)),
-                ..KeyframeCorrection::of_place(
+                ..KeyframeCorrection::of_pose(
                     keyframe.keyframe_id,
                     *by * keyframe.map_from_keyframe,
                 )
@@ -63,7 +63,7 @@ impl Mapper {
                 {
                     world.scale /= by.scale;
                 }
-                window.follow(closure);
+                window.apply_closure(closure);
                 outcome
             }
             // Non-finite values: leave the map unchanged.
@@ -78,7 +78,7 @@ mod tests {
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::{Matrix7, Sim3};
     use crate::slam::loops::LoopParams;
-    use crate::slam::loops::known::{KnownLoops, Link};
+    use crate::slam::loops::record::{Link, LoopRecord};
     use crate::slam::map::{EpochJoin, Map};
     use crate::slam::mapper::MapperParams;
     use crate::slam::mapper::phase::Active;
@@ -107,7 +107,7 @@ mod tests {
 
     /// The world's x of a camera that is `x` away from the active keyframe.
     fn in_world(mapper: &Mapper, x: f64) -> f64 {
-        mapper.keyframe().unwrap().world_from_keyframe.place(&sideways(x)).translation.x
+        mapper.keyframe().unwrap().world_from_keyframe.transform_pose(&sideways(x)).translation.x
     }
 
     #[test]
@@ -160,7 +160,7 @@ mod tests {
             mapper.map.keyframes.push(Keyframe { keyframe_id: 2, epoch: 1, ..other });
             // An estimate changes the unit of one of the two after odometry has used it.
             let map_from_keyframe = Sim3::new(SE3::identity(), 1.2);
-            let keyframes = vec![KeyframeCorrection::of_place(0, map_from_keyframe)];
+            let keyframes = vec![KeyframeCorrection::of_pose(0, map_from_keyframe)];
             mapper.apply(&Correction { keyframes, ..Correction::default() }).unwrap();
             mapper.restore_keyframe(2, &SE3::identity());
             mapper.restore_keyframe(found_on, &SE3::identity());
@@ -194,17 +194,17 @@ mod tests {
     fn loops_are_stored_in_the_checkpoint_and_restored_from_it() {
         let mut mapper = mapper();
         let link = Link { i: 1, j: 0, j_from_i: Sim3::identity(), covariance: Matrix7::identity() };
-        let loops = Arc::new(KnownLoops { links: vec![link], ..KnownLoops::default() });
+        let loops = Arc::new(LoopRecord { links: vec![link], ..LoopRecord::default() });
         mapper.map.loops = loops;
-        mapper.take_up_loops();
+        mapper.resume_loops();
         let window = mapper.window.take().unwrap();
         mapper.map.loops = Arc::default();
-        mapper.put_back(window);
+        mapper.return_window(window);
         let checkpoint = mapper.checkpoint().unwrap();
         assert_eq!(checkpoint.loops.links, [link]);
         let mut other = Mapper::new(CAMERA, MapperParams::default()).unwrap();
-        other.resume(checkpoint.over(Map::default()));
-        assert_eq!(other.window.as_ref().unwrap().loops.known().links, [link]);
+        other.resume(checkpoint.merged_over(Map::default()));
+        assert_eq!(other.window.as_ref().unwrap().loops.record().links, [link]);
     }
 
     #[test]

@@ -30,13 +30,13 @@ impl Mapper {
             }
         }
         // Odometry keeps the camera's pose and its own unit.
-        let world_from_camera = self.world_from_map.place(&before);
+        let world_from_camera = self.world_from_map.transform_pose(&before);
         let joined = correction.joins.iter().filter(|join| Some(join.epoch) == epoch);
         let unit = joined.map(|join| join.into_from_epoch.scale).product::<f64>()
             * correction.unit.unwrap_or(1.0);
         let scale = self.world_from_map.scale / unit;
         self.world_from_map = Sim3::between(&after, &world_from_camera, scale);
-        self.publish_place();
+        self.publish_pose();
         Ok(StepOutcome { keyframe_changed: true, graph_changed: true, ..finished })
     }
 
@@ -46,7 +46,7 @@ impl Mapper {
         let of_epoch = |id: u64| self.map.get(id).filter(|known| known.epoch == active.epoch);
         let tracked = self.last_tracked.filter(|(id, _)| of_epoch(*id).is_some());
         let (keyframe_id, at) = tracked.unwrap_or((active.keyframe_id, SE3::identity()));
-        self.map.place(keyframe_id, &at)
+        self.map.frame_pose(keyframe_id, &at)
     }
 
     /// The correction of the active keyframe; `None` where it is not corrected.
@@ -59,7 +59,7 @@ impl Mapper {
     /// keeps its last odometry pose.
     pub(super) fn anchor(&mut self, keyframe_id: u64, keyframe_from_camera: &SE3) {
         self.last_tracked = Some((keyframe_id, *keyframe_from_camera));
-        let map_from_camera = self.map.place(keyframe_id, keyframe_from_camera);
+        let map_from_camera = self.map.frame_pose(keyframe_id, keyframe_from_camera);
         if let (Some(map), Some(world)) = (map_from_camera, self.last_world_from_camera) {
             self.world_from_map = Sim3::between(&map, &world, self.world_from_map.scale);
         }

@@ -69,7 +69,7 @@ impl DepthBuffers {
 
     /// Propagates the spare depth to the active one, whose frame is at `frame_from_spare`, in the unit of the spare
     /// depth, and has this brightness relative to the spare one's image.
-    pub(super) fn carry(
+    pub(super) fn propagate_spare(
         &mut self,
         frame_from_spare: &SE3,
         brightness: Brightness,
@@ -81,14 +81,14 @@ impl DepthBuffers {
     }
 
     /// Chooses the points that the interval filter traces.
-    pub(super) fn plant_points(&mut self, params: &MapperParams) {
+    pub(super) fn choose_traced_points(&mut self, params: &MapperParams) {
         if params.window.traces_candidates() {
             self.maturing.restart(&self.active.image, &params.candidates);
         }
         let filter = params.depth_filter;
         match filter.has_points() {
             true if filter.is_dense() => self.points.restart_where_empty(&self.active),
-            true => self.points.restart_with_known(&mut self.active, &params.candidates),
+            true => self.points.restart_from_map(&mut self.active, &params.candidates),
             false => {}
         }
     }
@@ -117,7 +117,7 @@ impl DepthBuffers {
     }
 
     /// Multiplies the unit of all depth by `factor`.
-    pub(super) fn grow_unit(&mut self, factor: f64) {
+    pub(super) fn scale_unit(&mut self, factor: f64) {
         self.unit *= factor;
         self.rescale(factor as f32);
     }
@@ -139,8 +139,8 @@ impl DepthBuffers {
     }
 
     /// Keeps the mature points among those to be estimated jointly when the keyframe is left.
-    pub(super) fn leave_points(&mut self, keyframe_id: u64, params: &MapperParams) {
-        self.maturing.leave(keyframe_id, &self.active.image, self.unit, &params.interval);
+    pub(super) fn keep_mature_points(&mut self, keyframe_id: u64, params: &MapperParams) {
+        self.maturing.keep_points(keyframe_id, &self.active.image, self.unit, &params.interval);
     }
 }
 

@@ -7,14 +7,14 @@
 
 use crate::slam::depth::gaussian::ObservationCounts;
 use crate::slam::mapper::consistency::{Contradiction, is_plausible_ratio};
-use crate::slam::mapper::phase::Lasting;
+use crate::slam::mapper::phase::ElapsedTime;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::modes::ModeCovariance;
 use crate::slam::pose::PoseEstimate;
 
 /// Time by the frames' stamps within which the estimate must have entered, seconds: it waits for one that is running,
 /// and takes a few tenths itself.
-const MOST_SECS: f64 = 0.7;
+const MAX_WAIT_SECS: f64 = 0.7;
 
 /// Keyframes without a contradiction after which a map may be estimated once more because of another.
 const TRUSTED_AFTER: u64 = 4;
@@ -32,7 +32,7 @@ pub(super) enum Doubt {
         /// The active keyframe at that time.
         keyframe_id: u64,
         /// Time since.
-        lasting: Lasting,
+        elapsed: ElapsedTime,
         /// Frames since.
         frames: usize,
         /// Whether the estimate is under way.
@@ -44,14 +44,14 @@ pub(super) enum Doubt {
 
 impl Doubt {
     /// Whether the map is in doubt; if so, the next estimate is the one that settles it.
-    pub(super) fn hand_over(&mut self) -> bool {
+    pub(super) fn begin_estimate(&mut self) -> bool {
         let Self::Raised { is_away, .. } = self else { return false };
         *is_away = true;
         true
     }
 
     /// The estimate was dropped: the next one replaces it.
-    pub(super) fn take_back(&mut self) {
+    pub(super) fn drop_estimate(&mut self) {
         if let Self::Raised { is_away, .. } = self {
             *is_away = false;
         }
@@ -76,7 +76,7 @@ impl Mapper {
             contradiction = of_start.or(contradiction);
         }
         let is_rejected = contradiction.is_some_and(|contradiction| self.contradict(contradiction));
-        if !(is_rejected || self.has_waited_in_vain(pose.capture_nanos)) {
+        if !(is_rejected || self.has_timed_out(pose.capture_nanos)) {
             return None;
         }
         Some(StepOutcome {
@@ -99,9 +99,9 @@ impl Mapper {
             Doubt::Settled(then) => active >= then.saturating_add(TRUSTED_AFTER),
         };
         if may_help && is_new && self.is_estimated {
-            let (lasting, frames, is_away) = (Lasting::default(), 0, false);
+            let (elapsed, frames, is_away) = (ElapsedTime::default(), 0, false);
             self.doubt =
-                Doubt::Raised { contradiction, keyframe_id: active, lasting, frames, is_away };
+                Doubt::Raised { contradiction, keyframe_id: active, elapsed, frames, is_away };
             return false;
         }
         self.reject(contradiction);
@@ -109,14 +109,14 @@ impl Mapper {
     }
 
     /// Counts a frame of a map in doubt; rejects the map and returns true if it was not estimated again in time.
-    fn has_waited_in_vain(&mut self, nanos: i64) -> bool {
+    fn has_timed_out(&mut self, nanos: i64) -> bool {
         // In lockstep an estimate enters after a fixed number of frames: first one that is running, then its own.
         let least_frames = 2 * (self.params.window.delay_frames + 1);
-        let Doubt::Raised { contradiction, lasting, frames, .. } = &mut self.doubt else {
+        let Doubt::Raised { contradiction, elapsed, frames, .. } = &mut self.doubt else {
             return false;
         };
         *frames += 1;
-        let is_late = lasting.secs(nanos) > MOST_SECS && *frames > least_frames;
+        let is_late = elapsed.secs(nanos) > MAX_WAIT_SECS && *frames > least_frames;
         let contradiction = *contradiction;
         if is_late {
             self.reject(contradiction);
@@ -126,7 +126,7 @@ impl Mapper {
 
     /// Publishes the modes of the active keyframe of a map in doubt as unknown until an estimate replaces them; true
     /// where that changed them.
-    pub(super) fn tell_doubt(&mut self) -> bool {
+    pub(super) fn publish_doubt(&mut self) -> bool {
         if !matches!(self.doubt, Doubt::Raised { .. }) {
             return false;
         }
@@ -136,7 +136,7 @@ impl Mapper {
             return false;
         }
         self.revision += 1;
-        self.publish_place();
+        self.publish_pose();
         let Some(keyframe) = self.keyframe_mut() else { return false };
         keyframe.mode_covariance = said;
         true
@@ -224,7 +224,7 @@ mod tests {
         for (scale, rejects) in [(1.0, false), (3.0, true)] {
             let mut mapper = mapper(true);
             assert!(!mapper.contradict(Contradiction::ScaleJump));
-            assert!(mapper.doubt.hand_over());
+            assert!(mapper.doubt.begin_estimate());
             mapper.map.keyframes[1].map_from_keyframe.scale = scale;
             assert_eq!((mapper.settle_doubt(), is_rejected(&mapper)), (rejects, rejects));
         }
@@ -235,12 +235,12 @@ mod tests {
         let mut mapper = mapper(true);
         mapper.contradict(Contradiction::FailedSearches);
         // A dropped estimate is repeated.
-        assert!(mapper.doubt.hand_over());
-        mapper.doubt.take_back();
+        assert!(mapper.doubt.begin_estimate());
+        mapper.doubt.drop_estimate();
         assert!(!mapper.settle_doubt(), "another's estimate is not it");
         assert!(matches!(mapper.doubt, Doubt::Raised { is_away: false, .. }));
         let is_waiting =
-            |mapper: &mut Mapper, frame: i64| !mapper.has_waited_in_vain(frame * 10_000_000);
+            |mapper: &mut Mapper, frame: i64| !mapper.has_timed_out(frame * 10_000_000);
         // At 100 Hz: a higher frame rate does not shorten the time.
         let waits = (0..500).take_while(|&frame| is_waiting(&mut mapper, frame)).count();
         assert!((65..=75).contains(&waits), "{waits}");
@@ -252,7 +252,7 @@ mod tests {
         let mut mapper = mapper(true);
         mapper.contradict(Contradiction::FailedSearches);
         let is_waiting =
-            |mapper: &mut Mapper, frame: i64| !mapper.has_waited_in_vain(frame * 1_000_000_000);
+            |mapper: &mut Mapper, frame: i64| !mapper.has_timed_out(frame * 1_000_000_000);
         let waits = (0..100).take_while(|&frame| is_waiting(&mut mapper, frame)).count();
         assert_eq!(waits, 2 * (mapper.params.window.delay_frames + 1));
     }
@@ -262,19 +262,19 @@ mod tests {
         let mut mapper = mapper(true);
         let deviations = |mapper: &Mapper| mapper.keyframe().unwrap().mode_covariance.std_devs();
         let before = mapper.keyframe().unwrap().revision;
-        assert!(!mapper.tell_doubt() && deviations(&mapper).max() == 0.0);
+        assert!(!mapper.publish_doubt() && deviations(&mapper).max() == 0.0);
         mapper.contradict(Contradiction::FailedSearches);
-        assert!(mapper.tell_doubt() && deviations(&mapper).min() > 0.9);
+        assert!(mapper.publish_doubt() && deviations(&mapper).min() > 0.9);
         assert!(mapper.keyframe().unwrap().revision > before);
         // Once is enough, until the covariance is overwritten.
-        assert!(!mapper.tell_doubt());
+        assert!(!mapper.publish_doubt());
         mapper.keyframe_mut().unwrap().mode_covariance = ModeCovariance::ZERO;
-        assert!(mapper.tell_doubt());
+        assert!(mapper.publish_doubt());
         // The estimate replaces it.
         let mut window = mapper.begin_adjustment(false).unwrap();
         window.optimise();
         mapper.end_adjustment(window);
         assert_eq!(mapper.doubt, Doubt::Settled(1));
-        assert!(!mapper.tell_doubt() && deviations(&mapper).max() < 0.5);
+        assert!(!mapper.publish_doubt() && deviations(&mapper).max() < 0.5);
     }
 }

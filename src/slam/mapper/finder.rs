@@ -18,21 +18,21 @@ use crate::slam::mapper::recovery::RecoveryParams;
 use crate::slam::mapper::turned_views::TurnedViews;
 use crate::slam::places::{Describer, PlaceCandidate, PlaceIndex};
 use crate::slam::pose::Brightness;
-use crate::slam::tracker::motion::turned;
+use crate::slam::tracker::motion::rotations_around;
 use crate::slam::tracker::verdict::{VerdictParams, is_better, quality_of};
 
 /// Correlation of small images below which a keyframe is not tried: of 24 alignments that succeeded while the camera
 /// was lost in a recording, 19 were at 0.8 or more, the others, on views turned by 22° to 57°, at 0.44 to 0.65.
-const LEAST_SIMILARITY: f32 = 0.3;
+const MIN_SIMILARITY: f32 = 0.3;
 
 /// Features that an image and a keyframe must share to be aligned: other places share up to twelve; alignment decides.
-const LEAST_SHARED: f32 = 8.0;
+const MIN_SHARED: f32 = 8.0;
 
 /// Newest keyframes whose small images are compared: 12 µs each. The index holds all keyframes.
-const MOST_COMPARED: usize = 300;
+const MAX_COMPARED: usize = 300;
 
 /// New keyframes that are indexed per frame: 2.5 ms each at 640×480.
-pub(super) const MOST_LEARNT: usize = 10;
+pub(super) const MAX_INDEXED: usize = 10;
 
 /// Fewest points of a keyframe that is searched: one per hundred pixels.
 fn least_points(camera: &Intrinsics) -> usize {
@@ -107,10 +107,11 @@ impl Finder {
     ) -> Option<(usize, SE3)> {
         let camera = keyframes.get(active.unwrap_or(0))?.intrinsics;
         let seen = Appearance::of(pixels, camera.width, camera.height)?;
-        self.learn(keyframes, MOST_LEARNT);
-        let mut alike = self.alike(keyframes, active, &seen).into_iter();
+        self.index_new(keyframes, MAX_INDEXED);
+        let mut alike = self.rank_by_appearance(keyframes, active, &seen).into_iter();
         let most = params.num_keyframes;
-        let mut sharing = self.sharing(keyframes, active, &camera, pixels, most).into_iter();
+        let mut sharing =
+            self.rank_by_features(keyframes, active, &camera, pixels, most).into_iter();
         let doubted = self.doubted.take();
         let mut candidates: Vec<(usize, SE3)> = Vec::new();
         for _ in 0..params.num_keyframes {
@@ -146,7 +147,7 @@ impl Finder {
 
     /// Eligible keyframes, those that share most features with `pixels` first, and the rotation of the camera against
     /// each if nothing is near.
-    fn sharing(
+    fn rank_by_features(
         &mut self,
         keyframes: &[Keyframe],
         active: Option<usize>,
@@ -161,7 +162,7 @@ impl Finder {
             .map(|index| (keyframes[index].keyframe_id, index))
             .collect();
         let found = self.places.candidates(&seen, most, |id| !index_of.contains_key(&id));
-        let found = found.into_iter().filter(|candidate| candidate.score >= LEAST_SHARED);
+        let found = found.into_iter().filter(|candidate| candidate.score >= MIN_SHARED);
         let turned = |candidate: PlaceCandidate| {
             let rotation = candidate.rotation(camera);
             (index_of[&candidate.keyframe_id], SE3 { rotation, ..SE3::identity() })
@@ -170,16 +171,16 @@ impl Finder {
     }
 
     /// Eligible keyframes, those most similar to `seen` first, the newest of equals.
-    fn alike(
+    fn rank_by_appearance(
         &self,
         keyframes: &[Keyframe],
         active: Option<usize>,
         seen: &Appearance,
     ) -> Vec<usize> {
         let mut rated: Vec<(f32, usize)> = eligible(keyframes, active)
-            .take(MOST_COMPARED)
+            .take(MAX_COMPARED)
             .filter_map(|index| Some((self.appearance(&keyframes[index])?.similarity(seen), index)))
-            .filter(|(similarity, _)| *similarity > LEAST_SIMILARITY)
+            .filter(|(similarity, _)| *similarity > MIN_SIMILARITY)
             .collect();
         rated.sort_by(|one, other| other.0.total_cmp(&one.0));
         rated.into_iter().map(|(_, index)| index).collect()
@@ -196,7 +197,7 @@ impl Finder {
         params: &RecoveryParams,
     ) -> Option<(usize, SE3)> {
         /// Keyframes that are compared per frame: about a millisecond each.
-        const MOST_COMPARED: usize = 24;
+        const MAX_COMPARED: usize = 24;
         /// Search around a rotation that was found: half a step between rotations.
         const ROTATION_DEG: f64 = 4.5;
         /// Largest rotation of the pose from there, degrees: a step of each rotation, plus the effect of near points.
@@ -205,12 +206,12 @@ impl Finder {
         let most = params.keyframes_per_frame.min(params.num_keyframes);
         let camera = keyframes.get(active.unwrap_or(0)).filter(|_| most > 0)?.intrinsics;
         let seen = Appearance::of(pixels, camera.width, camera.height)?;
-        self.learn(keyframes, MOST_LEARNT);
+        self.index_new(keyframes, MAX_INDEXED);
         let eligible: Vec<usize> = eligible(keyframes, active)
             .filter(|index| Some(*index) != self.doubted)
             .filter(|&index| self.appearance(&keyframes[index]).is_some())
             .collect();
-        let count = eligible.len().min(MOST_COMPARED);
+        let count = eligible.len().min(MAX_COMPARED);
         let candidates: Vec<usize> =
             (0..count).map(|k| eligible[(*compared + k) % eligible.len()]).collect();
         *compared += count;
@@ -247,7 +248,7 @@ impl Finder {
     }
 
     /// Indexes at most `most` new keyframes, and describes those without a description.
-    pub(super) fn learn(&mut self, keyframes: &mut [Keyframe], most: usize) {
+    pub(super) fn index_new(&mut self, keyframes: &mut [Keyframe], most: usize) {
         let known = self.appearances.last().map(|(id, _)| *id);
         self.forget_all_but(keyframes);
         let new = keyframes.iter_mut().filter(|keyframe| Some(keyframe.keyframe_id) > known);
@@ -284,7 +285,7 @@ impl Finder {
 
     /// Aligns a frame to `keyframe` from the expected pose; `None` where it does not fit, or ends further from that
     /// pose than `max_disagreement`, translation in mean depths plus rotation in radians.
-    pub(super) fn locate(
+    pub(super) fn inverse_transform_pose(
         &mut self,
         keyframe: &Keyframe,
         pixels: &[u8],
@@ -297,11 +298,11 @@ impl Finder {
         let (reference, pyramid) = (&self.reference, &self.pyramid);
         let found = self.aligner.align(reference, pyramid, &start, brightness, &mut |_| true);
         /// Share of inliers that agreement requires: less than a claim, since the initial pose is known.
-        const LEAST_INLIERS: f64 = 0.65;
+        const MIN_INLIERS: f64 = 0.65;
         let quality = quality_of(&found);
         let is_tracked = self.verdict.judge(&found, &quality, false, 0).is_tracked();
         let is_even = self.verdict.has_likely_gain(&found);
-        if !is_tracked || !is_even || quality.inlier_ratio < LEAST_INLIERS {
+        if !is_tracked || !is_even || quality.inlier_ratio < MIN_INLIERS {
             return None;
         }
         let error = (found.state.current_from_keyframe * *expected).log();
@@ -322,7 +323,7 @@ impl Finder {
         self.reference.prepare_into(keyframe, &mut self.scratch);
         let (aligner, reference, pyramid) = (&self.aligner, &self.reference, &self.pyramid);
         let mut best: Option<(Alignment, NormalEquations)> = None;
-        for keyframe_from_camera in turned(expected, rotation_rad) {
+        for keyframe_from_camera in rotations_around(expected, rotation_rad) {
             let start = keyframe_from_camera.inverse();
             let mut other = aligner.start(reference, pyramid, &start, Brightness::default());
             let level = other.level;
@@ -331,7 +332,7 @@ impl Finder {
             if !self.verdict.is_near(&other) {
                 continue;
             }
-            let explained = aligner.explanation(reference, pyramid, &other);
+            let explained = aligner.sums_with_exact_depth(reference, pyramid, &other);
             if best.as_ref().is_none_or(|(_, by_best)| is_better(&explained, by_best)) {
                 best = Some((other, explained));
             }

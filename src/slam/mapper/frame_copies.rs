@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::slam::frame::FrameView;
 
 /// Most unused copies that are kept for later frames, one byte a pixel each: as many as lie between two keyframes.
-const MOST_SPARE: usize = 30;
+const MAX_SPARE: usize = 30;
 
 /// The copies in use, and buffers for more.
 #[derive(Debug, Default)]
@@ -32,7 +32,7 @@ impl FrameCopies {
     }
 
     /// Frees the copies that are not in use; the others are freed when their last reference is dropped.
-    pub(super) fn let_go(&mut self) {
+    pub(super) fn free_unused(&mut self) {
         *self = Self::default();
     }
 
@@ -41,7 +41,7 @@ impl FrameCopies {
         let mut spare = 0;
         self.copies.retain_mut(|copy| {
             spare += usize::from(Arc::get_mut(copy).is_some());
-            Arc::get_mut(copy).is_none() || spare <= MOST_SPARE
+            Arc::get_mut(copy).is_none() || spare <= MAX_SPARE
         });
         for copy in &mut self.copies {
             if let Some(memory) = Arc::get_mut(copy).filter(|of| of.len() == pixels.len()) {
@@ -87,9 +87,9 @@ mod tests {
         assert_eq!(copies.copies.len(), 100);
         drop(kept);
         let _ = copy_of(&mut copies, 0);
-        assert_eq!(copies.copies.len(), MOST_SPARE);
+        assert_eq!(copies.copies.len(), MAX_SPARE);
         let kept = copy_of(&mut copies, 7);
-        copies.let_go();
+        copies.free_unused();
         assert_eq!((Arc::strong_count(&kept), kept[0]), (1, 7));
     }
 }

@@ -5,9 +5,9 @@ use std::sync::Arc;
 use crate::slam::alignment::reference::num_levels;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::sums::{LEAST_CONTRAST, SumPyramid};
+use crate::slam::image::sums::{MIN_CONTRAST, SumPyramid};
 use crate::slam::keyframe::Keyframe;
-use crate::slam::map::{PlacedFrame, RefinedDepth};
+use crate::slam::map::{RealignedFrame, RefinedDepth};
 use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::mapper::phase::Phase;
 use crate::slam::mapper::{Mapper, StepOutcome};
@@ -25,7 +25,7 @@ impl Mapper {
         self.is_estimated = true;
         let is_mapping = matches!(self.phase, Phase::Mapping);
         let active = self.keyframe().map(|keyframe| keyframe.keyframe_id);
-        let is_doubted = self.doubt.hand_over();
+        let is_doubted = self.doubt.begin_estimate();
         window.reconsiders |= is_doubted;
         let is_begun = match active {
             _ if is_new || is_doubted => {
@@ -56,7 +56,7 @@ impl Mapper {
         }
         let mut window = self.window.take()?;
         window.take_mature(&mut self.depth.maturing.left);
-        let is_new = window.take_in(&self.map, active);
+        let is_new = window.update_from_map(&self.map, active);
         window.loops.offer(&self.map.keyframes);
         Some((window, is_new))
     }
@@ -65,17 +65,17 @@ impl Mapper {
     pub fn end_adjustment(&mut self, mut window: Box<Window>) -> StepOutcome {
         if let Some(refined) = window.take_refined() {
             let graph_changed = self.take_refined(refined, &mut window);
-            self.put_back(window);
+            self.return_window(window);
             return StepOutcome { graph_changed, ..Default::default() };
         }
         if let Some(closure) = window.loops.take_closure() {
             let outcome = self.close_loop(&closure, &mut window);
-            self.put_back(window);
+            self.return_window(window);
             return outcome;
         }
-        if let Some(placed) = window.take_frames_alone() {
-            placed.iter().for_each(|frame| self.map.place_frame(frame));
-            self.put_back(window);
+        if let Some(placed) = window.take_planned_frames() {
+            placed.iter().for_each(|frame| self.map.store_frame_pose(frame));
+            self.return_window(window);
             return StepOutcome { graph_changed: !placed.is_empty(), ..Default::default() };
         }
         let finished = self.finish_keyframe();
@@ -86,26 +86,26 @@ impl Mapper {
             outcome.keyframe_changed = true;
         }
         if let Some(rejected) = self.reject_refuted(&mut window) {
-            self.put_back(window);
+            self.return_window(window);
             return rejected;
         }
         let params = &self.params.modes;
-        let said_of = |of: &Marginal| {
-            (self.modes.of_estimate(of, params), self.modes.place_of_estimate(of, params))
+        let covariances_of = |of: &Marginal| {
+            (self.modes.of_estimate(of, params), self.modes.pose_covariance_of_estimate(of, params))
         };
-        let correction = window.correction(&self.map, said_of);
+        let correction = window.correction(&self.map, covariances_of);
         if !correction.keyframes.is_empty() {
-            window.watch(&self.map, &correction);
+            window.request_pass_on_jump(&self.map, &correction);
             // The values are checked: invalid ones leave the map unchanged.
             match self.apply(&correction) {
                 Ok(applied) => outcome = applied,
-                Err(_) => window.leave_unrefined(),
+                Err(_) => window.discard_refinement(),
             }
         }
-        for placed in window.take_placed() {
-            self.map.place_frame(&placed);
+        for placed in window.take_realigned() {
+            self.map.store_frame_pose(&placed);
         }
-        self.put_back(window);
+        self.return_window(window);
         outcome.keyframe_changed |= finished.keyframe_changed | self.settle_doubt();
         outcome
     }
@@ -117,8 +117,8 @@ impl Mapper {
         if !(is_mapped && matches!(self.phase, Phase::Mapping | Phase::Lost(_))) {
             return None;
         }
-        drop(window.take_placed());
-        window.leave_unrefined();
+        drop(window.take_realigned());
+        window.discard_refinement();
         self.reject(Contradiction::WrongStart);
         Some(StepOutcome { keyframe_changed: true, graph_changed: true, ..Default::default() })
     }
@@ -138,7 +138,7 @@ impl Mapper {
         let Some(window) = &mut self.window else { return false };
         let Some(keyframe_id) = window.next_unrefined() else { return false };
         let keyframe = self.map.get(keyframe_id).filter(|of| of.has_depth() && !of.is_refined);
-        let refined = keyframe.and_then(|keyframe| window.refined(keyframe));
+        let refined = keyframe.and_then(|keyframe| window.refine_keyframe(keyframe));
         if let Some(refined) = refined {
             self.revision += 1;
             self.map.refine(refined, self.revision);
@@ -153,28 +153,28 @@ impl Mapper {
         let is_active = self.keyframe().is_some_and(|active| active.keyframe_id == keyframe_id);
         let is_same = |of: &&Keyframe| of.has_depth() && of.revision == refined.of_revision;
         if is_active || self.map.get(keyframe_id).filter(is_same).is_none() {
-            window.refine_later(keyframe_id);
+            window.requeue_refinement(keyframe_id);
             return false;
         }
         self.revision += 1;
         self.map.refine(refined, self.revision);
-        self.tell_left(keyframe_id);
+        self.queue_keyframe_to_save(keyframe_id);
         true
     }
 
     /// Stores the points of the joint estimate in the map; call it before the map is written.
-    pub fn keep_confirmed(&mut self) {
+    pub fn store_confirmed_points(&mut self) {
         if let Some(window) = &self.window {
             self.map.confirmed = window.confirmed_points(&self.map);
         }
     }
 
     /// Keeps a tracked frame until it is aligned again.
-    pub(super) fn keep_frame(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) {
+    pub(super) fn queue_frame(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) {
         let most = self.params.window.max_waiting_frames;
-        if self.aligns_again() {
+        if self.realigns_frames() {
             let (copy, at) = (self.copies.of(frame), &pose.keyframe_from_camera);
-            keep(&mut self.tracked, most, (frame.sequence, copy), (pose.keyframe_id, at));
+            push_bounded(&mut self.tracked, most, (frame.sequence, copy), (pose.keyframe_id, at));
         }
     }
 
@@ -182,22 +182,22 @@ impl Mapper {
     /// explains it, and cannot lead to the frames before it: these are dropped.
     pub(super) fn keep_early_frame(&mut self, frame: &FrameView<'_>) {
         /// Two seconds at 30 Hz, one byte a pixel each.
-        const MOST: usize = 60;
-        if !self.aligns_again() {
+        const MAX_QUEUED_FRAMES: usize = 60;
+        if !self.realigns_frames() {
             return;
         }
         let levels = num_levels(frame.width, frame.height);
         let mut pyramid = SumPyramid::with_size(frame.width, frame.height, levels, levels - 1);
         pyramid.fill(frame.pixels);
-        if pyramid.contrast() < LEAST_CONTRAST {
+        if pyramid.contrast() < MIN_CONTRAST {
             self.early.clear();
             return;
         }
         let (copy, at) = (self.copies.of(frame), &SE3::identity());
-        keep(&mut self.early, MOST, (frame.sequence, copy), (NO_KEYFRAME, at));
+        push_bounded(&mut self.early, MAX_QUEUED_FRAMES, (frame.sequence, copy), (NO_KEYFRAME, at));
     }
 
-    fn aligns_again(&self) -> bool {
+    fn realigns_frames(&self) -> bool {
         self.params.window.num_free > 0 && self.params.window.max_waiting_frames > 0
     }
 
@@ -221,7 +221,11 @@ impl Mapper {
         for keyframe in [first, second].map(|keyframe| (keyframe.sequence, keyframe.keyframe_id)) {
             let (sequence, keyframe_id) = keyframe;
             let keyframe_from_camera = SE3::identity();
-            self.map.place_frame(&PlacedFrame { sequence, keyframe_id, keyframe_from_camera });
+            self.map.store_frame_pose(&RealignedFrame {
+                sequence,
+                keyframe_id,
+                keyframe_from_camera,
+            });
         }
     }
 
@@ -229,18 +233,18 @@ impl Mapper {
     /// another map.
     pub fn drop_adjustment(&mut self, mut window: Box<Window>) {
         // The frames keep the poses that the tracker gave them.
-        drop(window.take_frames_alone());
-        drop(window.take_placed());
-        window.leave_unrefined();
+        drop(window.take_planned_frames());
+        drop(window.take_realigned());
+        window.discard_refinement();
         window.repeat_piece();
         window.loops.repeat_closure();
-        self.doubt.take_back();
-        self.put_back(window);
+        self.doubt.drop_estimate();
+        self.return_window(window);
     }
 }
 
 /// Appends the copy of a frame to a list of at most `most`; the oldest is dropped.
-fn keep(
+fn push_bounded(
     frames: &mut Vec<TrackedFrame>,
     most: usize,
     (sequence, pixels): (u64, Arc<[u8]>),

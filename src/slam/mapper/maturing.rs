@@ -12,7 +12,7 @@ use crate::slam::window::candidates::MaturePoints;
 
 /// Most keyframes whose points are kept until they are taken: some are left during an estimate. Where none are taken,
 /// as during a start or while the window is out, the oldest are dropped; their points then come from their depth.
-const MOST_LEFT: usize = 16;
+const MAX_LISTS: usize = 16;
 
 /// Candidates of the active keyframe, in the unit of its depth buffer, and the mature points of keyframes that were
 /// left.
@@ -48,7 +48,7 @@ impl Maturing {
 
     /// Keeps the mature points of the keyframe that is being left; `unit` is the unit of its depth buffer in the
     /// keyframe's. A keyframe on which no frame was tracked leaves no list: its depth is all that is known of it.
-    pub(super) fn leave(
+    pub(super) fn keep_points(
         &mut self,
         keyframe_id: u64,
         image: &GradientImage,
@@ -66,7 +66,7 @@ impl Maturing {
             });
             let points = points.collect();
             self.left.retain(|left| left.keyframe_id != keyframe_id);
-            let surplus = (self.left.len() + 1).saturating_sub(MOST_LEFT);
+            let surplus = (self.left.len() + 1).saturating_sub(MAX_LISTS);
             self.left.drain(..surplus);
             self.left.push(MaturePoints { keyframe_id, points });
         }
@@ -140,7 +140,7 @@ mod tests {
             let of_filter = maturing.filter.points().iter();
             let mature: Vec<_> = of_filter.filter(|p| p.is_mature(&params)).cloned().collect();
             let all = maturing.filter.points().len();
-            maturing.leave(KEYFRAME, &image, UNIT, &params);
+            maturing.keep_points(KEYFRAME, &image, UNIT, &params);
             assert!(maturing.filter.points().is_empty());
             let [left] = &maturing.left[..] else { panic!("one keyframe was left") };
             let pixels = |points: &[DepthPoint]| -> Vec<_> {
@@ -164,10 +164,10 @@ mod tests {
     #[test]
     fn points_that_are_not_taken_are_kept_once_for_each_of_the_last_keyframes() {
         let (mut maturing, image, _) = traced(1);
-        let last = MOST_LEFT as u64 + 3;
+        let last = MAX_LISTS as u64 + 3;
         for keyframe_id in (0..=last).flat_map(|id| [id, id]) {
             maturing.is_traced = true;
-            maturing.leave(keyframe_id, &image, UNIT, &IntervalParams::default());
+            maturing.keep_points(keyframe_id, &image, UNIT, &IntervalParams::default());
         }
         let kept: Vec<u64> = maturing.left.iter().map(|left| left.keyframe_id).collect();
         assert_eq!(kept, Vec::from_iter(4..=last));
@@ -176,14 +176,14 @@ mod tests {
     #[test]
     fn a_keyframe_without_a_frame_leaves_no_list() {
         let (mut maturing, image, _) = traced(0);
-        maturing.leave(KEYFRAME, &image, UNIT, &IntervalParams::default());
+        maturing.keep_points(KEYFRAME, &image, UNIT, &IntervalParams::default());
         assert!(maturing.left.is_empty());
     }
 
     #[test]
     fn points_that_were_left_are_corrected_with_their_keyframe() {
         let (mut maturing, image, _) = traced(8);
-        maturing.leave(KEYFRAME, &image, UNIT, &IntervalParams::default());
+        maturing.keep_points(KEYFRAME, &image, UNIT, &IntervalParams::default());
         let before = maturing.left[0].points.clone();
         let doubled = |keyframe_id| KeyframeCorrection {
             keyframe_id,

@@ -8,13 +8,13 @@ use crate::slam::depth::common_error::{JointCovariance, PoseByModes, SampledDept
 use crate::slam::depth::map::DepthMap;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::keyframe_pose_covariance::KeyframePoseCovariance;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::place_covariance::PlaceCovariance;
 use crate::slam::pose::{PoseEstimate, full_covariance};
 use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::window::marginals::Marginal;
-use crate::slam::window::place_marginals::PlaceMarginal;
+use crate::slam::window::place_marginals::KeyframePoseMarginal;
 
 /// Tuning of the covariance of common depth errors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -97,14 +97,14 @@ impl KeyframeModes {
 
     /// The place covariance that a keyframe publishes after that estimate: noise, plus its image's displacement, which
     /// all goes into its pose; `None` where the estimate has none.
-    pub(super) fn place_of_estimate(
+    pub(super) fn pose_covariance_of_estimate(
         &self,
         marginal: &Marginal,
         params: &ModeParams,
-    ) -> Option<PlaceCovariance> {
-        let PlaceMarginal { noise, of_displaced } = marginal.place?;
+    ) -> Option<KeyframePoseCovariance> {
+        let KeyframePoseMarginal { noise, of_displaced } = marginal.place?;
         let displaced = of_displaced * self.squared_displacement.unwrap_or_default();
-        Some(PlaceCovariance::bounded(&(noise * params.estimate_inflation + displaced)))
+        Some(KeyframePoseCovariance::bounded(&(noise * params.estimate_inflation + displaced)))
     }
 
     /// Rescales after the unit of the depth has grown by `factor` since the current frame was considered.
@@ -122,13 +122,13 @@ impl KeyframeModes {
         pose: &Matrix6<f64>,
     ) {
         self.samples.take(depth, intrinsics);
-        let by_pose = self.samples.begun(current_from_keyframe);
+        let by_pose = self.samples.modes_by_pose(current_from_keyframe);
         self.joint = by_pose.map(|by_pose| JointCovariance::of_start(&by_pose, pose));
         self.covariance = self.joint.map_or_else(Matrix3::zeros, |joint| joint.modes);
     }
 
     /// Considers a frame before it is observed on `depth`, whose unit in the keyframe's is `unit`.
-    pub(super) fn consider(
+    pub(super) fn begin_frame(
         &mut self,
         depth: &DepthMap,
         unit: f64,
@@ -155,22 +155,22 @@ impl KeyframeModes {
     }
 
     /// Updates the modes after that frame was observed.
-    pub(super) fn observed(&mut self, depth: &DepthMap, frame_from_keyframe: &SE3) {
+    pub(super) fn update_after_observation(&mut self, depth: &DepthMap, frame_from_keyframe: &SE3) {
         let Some(joint) = &mut self.joint else { return };
-        if let Some(response) = self.samples.observed(depth, frame_from_keyframe) {
+        if let Some(response) = self.samples.response_to_observation(depth, frame_from_keyframe) {
             *joint = joint.after(&response);
             self.covariance = joint.modes;
         }
     }
 
     /// Propagates the modes to that frame, the next keyframe, from those of the previous one and its pose error.
-    pub(super) fn carry(
+    pub(super) fn propagate_modes(
         &mut self,
         frame_from_keyframe: &SE3,
         intrinsics: &Intrinsics,
         params: &ModeParams,
     ) {
-        let response = self.samples.carried(frame_from_keyframe, intrinsics);
+        let response = self.samples.response_to_propagation(frame_from_keyframe, intrinsics);
         if let (Some(joint), Some(response)) = (self.joint.take(), response) {
             self.covariance = joint.after(&response).modes;
         }
@@ -268,8 +268,8 @@ mod tests {
         let (after, pose) = (narrowed(&map), pose(place, displacement_px));
         modes.enter(&ModeCovariance::of_std_devs([begun_at; 3]), &params);
         for _ in 0..frames {
-            modes.consider(&map, 1.0, &CAMERA, &pose, &params);
-            modes.observed(&after, &in_unit(&pose.keyframe_from_camera, 1.0));
+            modes.begin_frame(&map, 1.0, &CAMERA, &pose, &params);
+            modes.update_after_observation(&after, &in_unit(&pose.keyframe_from_camera, 1.0));
         }
         modes.published(&params).std_devs()
     }
@@ -313,8 +313,8 @@ mod tests {
         assert!((modes.published(&params).matrix() - said.matrix()).norm() < 1e-15);
         let map = depth();
         let still = pose(Vector6::zeros(), 0.0);
-        modes.consider(&map, 1.0, &CAMERA, &still, &params);
-        modes.carry(&SE3::identity(), &CAMERA, &params);
+        modes.begin_frame(&map, 1.0, &CAMERA, &still, &params);
+        modes.propagate_modes(&SE3::identity(), &CAMERA, &params);
         let grown = modes.published(&params).matrix() - said.matrix();
         assert!((grown - Matrix3::from_diagonal_element(1e-4)).norm() < 1e-6, "{grown}");
     }

@@ -24,7 +24,7 @@ pub(super) enum Phase {
 
 /// Time by the frames' stamps since the first of several frames.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct Lasting {
+pub(super) struct ElapsedTime {
     /// Stamp of the last frame.
     last_nanos: Option<i64>,
     nanos: i64,
@@ -34,7 +34,7 @@ pub(super) struct Lasting {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Loss {
     /// Since the first lost frame.
-    pub(super) lasting: Lasting,
+    pub(super) elapsed: ElapsedTime,
     /// Keyframes searched since then.
     pub(super) searched: usize,
     /// Keyframes that were compared with turned views.
@@ -60,7 +60,7 @@ impl Phase {
     }
 }
 
-impl Lasting {
+impl ElapsedTime {
     /// Adds a frame and returns the time so far, seconds. A step of the clock adds nothing if it is backwards, and no
     /// more than the longest time between frames if it is forwards.
     pub(super) fn secs(&mut self, nanos: i64) -> f64 {
@@ -95,8 +95,8 @@ mod tests {
     #[test]
     fn steps_of_the_clock_neither_delay_nor_end_a_search() {
         const SECOND: i64 = 1_000_000_000;
-        let mut lasting = Lasting::default();
-        let mut secs = |stamp: i64| lasting.secs(stamp);
+        let mut elapsed = ElapsedTime::default();
+        let mut secs = |stamp: i64| elapsed.secs(stamp);
         assert_eq!(secs(100 * SECOND), 0.0);
         assert_eq!(secs(101 * SECOND), 1.0);
         // An hour back, and on from there.

@@ -43,7 +43,7 @@ pub(super) struct Prior {
 impl Map {
     /// Combines `self`, the checkpoint of a mapper that died, with the map on the disk: adds the keyframes that only
     /// the older map has, and takes its depth for those that have none here.
-    pub fn over(mut self, older: Self) -> Self {
+    pub fn merged_over(mut self, older: Self) -> Self {
         self.free_epoch = self.free_epoch.max(older.free_epoch);
         self.revision = self.revision.max(older.revision);
         if self.loops.is_empty() {
@@ -69,7 +69,7 @@ impl Map {
 impl Mapper {
     /// Starts in a map of earlier runs, before the first frame: its epochs, ids and revisions continue, and its
     /// keyframes are searched for the camera in each frame. Odometry starts from the camera's pose in the map.
-    pub fn begin_in(&mut self, map: Map, map_use: MapUse) -> Result<(), PriorError> {
+    pub fn start_in_map(&mut self, map: Map, map_use: MapUse) -> Result<(), PriorError> {
         let foreign = map.keyframes.iter().find(|of| of.intrinsics != self.intrinsics);
         if let Some(foreign) = foreign {
             return Err(PriorError::Camera(foreign.keyframe_id));
@@ -94,7 +94,7 @@ impl Mapper {
         for keyframe in &mut self.map.keyframes {
             keyframe.world_from_keyframe = keyframe.map_from_keyframe;
         }
-        self.take_over();
+        self.index_map();
         self.phase = Phase::Lost(Loss::default());
         let certainty = Certainty::default();
         self.prior = Some(Prior { map_use, first_own: self.next_keyframe_id, certainty });
@@ -156,8 +156,8 @@ impl Mapper {
             self.modes.enter(&keyframe.mode_covariance, &self.params.modes);
         }
         self.revision += 1;
-        self.publish_place();
-        StepOutcome::restored(is_first)
+        self.publish_pose();
+        StepOutcome::keyframe_restored(is_first)
     }
 
     /// Pose of a keyframe's map in odometry's world, as last published with the keyframe.
@@ -188,7 +188,7 @@ mod tests {
 
     fn mapper_in(map: Map, map_use: MapUse) -> Mapper {
         let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
-        mapper.begin_in(map, map_use).unwrap();
+        mapper.start_in_map(map, map_use).unwrap();
         mapper
     }
 
@@ -201,7 +201,7 @@ mod tests {
             state: TrackingState::Tracking,
             keyframe_id: keyframe.keyframe_id,
             world_from_camera: sideways(x),
-            keyframe_from_camera: keyframe.map_from_keyframe.locate(&sideways(x)),
+            keyframe_from_camera: keyframe.map_from_keyframe.inverse_transform_pose(&sideways(x)),
             alignment_covariance: [1e-9; 21],
             proposes_keyframe: true,
             ..unknown
@@ -255,7 +255,7 @@ mod tests {
     fn a_map_of_another_camera_and_an_empty_map_to_locate_in_are_refused() {
         let scene = Scene::new(3);
         let begin = |map: Map, map_use| {
-            Mapper::new(CAMERA, MapperParams::default()).unwrap().begin_in(map, map_use)
+            Mapper::new(CAMERA, MapperParams::default()).unwrap().start_in_map(map, map_use)
         };
         let mut foreign = map(&scene);
         foreign.keyframes[1].intrinsics = Intrinsics { fx: CAMERA.fx + 1.0, ..CAMERA };
@@ -275,7 +275,7 @@ mod tests {
             free_epoch: 20,
             ..Map::default()
         };
-        let both = checkpoint.over(on_disk.clone());
+        let both = checkpoint.merged_over(on_disk.clone());
         let ids: Vec<u64> = both.keyframes.iter().map(|of| of.keyframe_id).collect();
         assert_eq!((ids, both.free_epoch), (vec![4, 7, 8], 20));
         assert_eq!(both.keyframes[1].map_from_keyframe.rigid, sideways(0.4));

@@ -8,7 +8,7 @@ use crate::slam::depth::common_error::rotation_std_dev;
 use crate::slam::depth::gaussian::MAX_VALIDITY;
 use crate::slam::depth::gradient_image::BORDER_PX;
 use crate::slam::depth::map::{DepthMap, Hypothesis};
-use crate::slam::depth::propagation::joined;
+use crate::slam::depth::propagation::merged_hypothesis;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::mapper::consistency::Contradiction;
@@ -17,7 +17,7 @@ use crate::slam::mapper::phase::{Loss, Phase};
 use crate::slam::mapper::{Mapper, StepInput, StepOutcome};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{DegradedReason, PoseEstimate, TrackingState, full_covariance};
-use crate::slam::tracker::MOST_DEVIATIONS;
+use crate::slam::tracker::MAX_POSE_DEVIATIONS;
 
 /// Largest difference of two poses for one place, translation in mean depths plus rotation in radians: a wrong place is
 /// further off, and a map that has drifted this far should not be continued.
@@ -86,19 +86,19 @@ impl Mapper {
         let is_held = pose.state.is_tracked()
             && !matches!(self.phase, Phase::Rejected(..))
             && !self.is_localising();
-        let lost_secs = if is_held { 0.0 } else { loss.lasting.secs(frame.capture_nanos) };
+        let lost_secs = if is_held { 0.0 } else { loss.elapsed.secs(frame.capture_nanos) };
         let active = self.active.map(|active| active.index);
         if active.is_some() || self.is_localising() {
             let (keyframes, params) = (&mut self.map.keyframes, &self.params.recovery);
             let searched = &mut loss.searched;
             let found = self.finder.find(keyframes, active, searched, frame.pixels, params);
-            if let Some((index, at)) = self.believed(found, pose, frame.pixels) {
+            if let Some((index, at)) = self.accepted(found, pose, frame.pixels) {
                 return self.restore_keyframe(index, &at);
             }
             let (keyframes, params) = (&mut self.map.keyframes, &self.params.recovery);
             let compared = &mut loss.compared;
             let found = self.finder.find_turned(keyframes, active, compared, frame.pixels, params);
-            if let Some((index, at)) = self.believed(found, pose, frame.pixels) {
+            if let Some((index, at)) = self.accepted(found, pose, frame.pixels) {
                 return self.restore_keyframe(index, &at);
             }
         }
@@ -122,7 +122,7 @@ impl Mapper {
 
     /// Returns `found` if it is confirmed and does not contradict the rotation that a view holds; otherwise the next
     /// search leaves it out.
-    fn believed(
+    fn accepted(
         &mut self,
         found: Option<(usize, SE3)>,
         pose: &PoseEstimate,
@@ -143,7 +143,7 @@ impl Mapper {
     /// Whether a pose in the epoch of a held pose is rotated against it by more than drift and uncertainty allow.
     fn contradicts_hold(&self, pose: &PoseEstimate, index: usize, at: &SE3) -> bool {
         /// Rotation by which the map may have drifted since the place was mapped, radians.
-        const MOST_DRIFT_RAD: f64 = 0.15;
+        const MAX_DRIFT_RAD: f64 = 0.15;
         let (Some(known), Some(held_on)) =
             (self.map.keyframes.get(index), self.map.get(pose.keyframe_id))
         else {
@@ -153,10 +153,10 @@ impl Mapper {
         if !is_held || known.epoch != held_on.epoch {
             return false;
         }
-        let found = known.map_from_keyframe.place(at).rotation;
+        let found = known.map_from_keyframe.transform_pose(at).rotation;
         let uncertain = rotation_std_dev(&full_covariance(&pose.map_covariance));
         found.angle_to(&pose.map_from_camera.rotation)
-            > MOST_DRIFT_RAD + MOST_DEVIATIONS * uncertain
+            > MAX_DRIFT_RAD + MAX_POSE_DEVIATIONS * uncertain
     }
 
     /// Whether another keyframe that sees the same place confirms the camera's pose: one alone may resemble something
@@ -169,28 +169,30 @@ impl Mapper {
         by: &Confirmation,
     ) -> bool {
         /// Keyframes that are checked.
-        const MOST: usize = 3;
+        const MAX_CONFIRMING: usize = 3;
         /// Largest distance of the camera from them, in their mean depths.
         const REACH: f64 = 0.7;
         /// Least share of their points that the camera must see: one that is turned far away sees no more of any.
-        const LEAST_USAGE: f64 = 0.2;
+        const MIN_USAGE: f64 = 0.2;
         let found = &self.map.keyframes[index];
         let epoch = found.epoch;
-        let map_from_camera = found.map_from_keyframe.place(keyframe_from_camera);
+        let map_from_camera = found.map_from_keyframe.transform_pose(keyframe_from_camera);
         let mut others: Vec<(f64, usize, SE3)> = self
             .map
             .seen_from(epoch, &map_from_camera, REACH)
             .filter(|(other, _)| *other != index && Some(*other) != by.except)
-            .filter(|(_, view)| view.usage >= LEAST_USAGE)
+            .filter(|(_, view)| view.usage >= MIN_USAGE)
             .filter(|(other, _)| self.map.keyframes[*other].map_state == MapState::Established)
             .map(|(other, view)| (view.usage, other, view.keyframe_from_camera))
             .collect();
         others.sort_by(|one, other| other.0.total_cmp(&one.0));
-        others.truncate(MOST);
+        others.truncate(MAX_CONFIRMING);
         let is_young = self.is_young(epoch);
         let mut agrees = |(_, other, expected): &(f64, usize, SE3)| {
             let keyframe = &self.map.keyframes[*other];
-            self.finder.locate(keyframe, pixels, expected, by.max_disagreement).is_some()
+            self.finder
+                .inverse_transform_pose(keyframe, pixels, expected, by.max_disagreement)
+                .is_some()
         };
         others.is_empty() && is_young || others.iter().any(&mut agrees)
     }
@@ -206,16 +208,16 @@ impl Mapper {
         /// Least share of the points in view that the image must agree with. Estimates have 0.9 and more, blurred
         /// images of the right place 0.44 and occasionally less, a different scene of low contrast 0.37. A wrong
         /// refusal costs a frame or two.
-        const LEAST_AGREEING: f64 = 0.4;
+        const MIN_AGREEING: f64 = 0.4;
         /// Largest difference of the two poses: that of two keyframes which each differ this far from the points.
         const MAX_APART: f64 = 2.0 * MAX_DISAGREEMENT;
         let Some(window) = &mut self.window else { return true };
         let keyframe_id = self.map.keyframes[index].keyframe_id;
-        let Some(seen) = window.sight(keyframe_id, keyframe_from_camera, pixels) else {
+        let Some(seen) = window.localise(keyframe_id, keyframe_from_camera, pixels) else {
             return true;
         };
         let apart = keyframe_from_camera.inverse() * seen.keyframe_from_camera;
-        seen.agreeing >= LEAST_AGREEING
+        seen.agreeing >= MIN_AGREEING
             && apart.translation.norm() + apart.rotation.angle() <= MAX_APART
     }
 
@@ -242,7 +244,7 @@ impl Mapper {
         index: usize,
         keyframe_from_camera: &SE3,
     ) -> StepOutcome {
-        self.leave_keyframe();
+        self.deactivate_keyframe();
         let Some(keyframe) = self.map.keyframes.get(index) else {
             return StepOutcome::default();
         };
@@ -265,9 +267,9 @@ impl Mapper {
         if self.is_locating() {
             return self.enter_unchanged(index);
         }
-        self.enter_keyframe(index);
+        self.activate_keyframe(index);
         // The first keyframe of a map of earlier runs publishes the others with it.
-        StepOutcome::restored(is_first)
+        StepOutcome::keyframe_restored(is_first)
     }
 }
 
@@ -298,7 +300,7 @@ pub(super) fn restore_points(map: &mut DepthMap, points: &[DepthPoint]) {
                 failures: 0,
             };
             *hypothesis = match hypothesis.is_some() {
-                true => joined(restored, hypothesis).unwrap_or(restored),
+                true => merged_hypothesis(restored, hypothesis).unwrap_or(restored),
                 false => restored,
             };
         }

@@ -25,7 +25,7 @@ impl Map {
 impl Mapper {
     /// Returns a keyframe that was left or refined and whose depth is final for now: call it after
     /// [`Mapper::finish_keyframe`], until it returns `None`.
-    pub fn take_left(&mut self) -> Option<&Keyframe> {
+    pub fn take_keyframe_to_save(&mut self) -> Option<&Keyframe> {
         while let Some(left) = self.left.pop_front() {
             if self.map.get(left).is_some_and(Keyframe::has_depth) {
                 return self.map.get(left);
@@ -35,24 +35,24 @@ impl Mapper {
     }
 
     /// Queues a keyframe whose depth may be worth saving.
-    pub(super) fn tell_left(&mut self, keyframe_id: u64) {
+    pub(super) fn queue_keyframe_to_save(&mut self, keyframe_id: u64) {
         /// Most keyframes in the queue, where none are taken.
-        const MOST: usize = 8;
+        const MAX_QUEUED_KEYFRAMES: usize = 8;
         self.left.retain(|&id| id != keyframe_id);
         self.left.push_back(keyframe_id);
-        let surplus = self.left.len().saturating_sub(MOST);
+        let surplus = self.left.len().saturating_sub(MAX_QUEUED_KEYFRAMES);
         self.left.drain(..surplus);
     }
 
     /// The active keyframe with its image and depth, and the poses of the others of its epoch; `None`
     /// where there is no established keyframe to continue from.
     pub fn checkpoint(&self) -> Option<Map> {
-        let in_force = self.keyframe()?;
-        if in_force.map_state != MapState::Established {
+        let current = self.keyframe()?;
+        if current.map_state != MapState::Established {
             return None;
         }
-        let of_epoch = self.map.keyframes.iter().filter(|k| k.epoch == in_force.epoch);
-        let keyframes = of_epoch.map(|keyframe| match std::ptr::eq(keyframe, in_force) {
+        let of_epoch = self.map.keyframes.iter().filter(|k| k.epoch == current.epoch);
+        let keyframes = of_epoch.map(|keyframe| match std::ptr::eq(keyframe, current) {
             true => keyframe.clone(),
             false => keyframe.without_depth(),
         });
@@ -60,7 +60,7 @@ impl Mapper {
             keyframes: keyframes.collect(),
             loops: Arc::clone(&self.map.loops),
             revision: self.map.revision,
-            active: Some(in_force.keyframe_id),
+            active: Some(current.keyframe_id),
             free_epoch: self.free_epoch().saturating_add(UNKNOWN_EPOCHS),
             ..Map::default()
         })
@@ -68,12 +68,12 @@ impl Mapper {
 
     /// Takes over from the mapper of another camera: its keyframes stay in the map, and epochs, ids and
     /// revisions continue.
-    pub fn succeed(&mut self, before: Self) {
+    pub fn continue_from(&mut self, before: Self) {
         self.map = before.map;
         self.revision = before.revision;
         self.next_keyframe_id = before.next_keyframe_id;
         self.first_free_epoch = before.first_free_epoch;
-        self.take_up_loops();
+        self.resume_loops();
     }
 
     /// Continues from a checkpoint: its keyframe becomes active again, the epoch and all ids continue. From a map that
@@ -101,7 +101,7 @@ impl Mapper {
             return StepOutcome::default();
         };
         self.map = Map { active: None, ..map };
-        self.take_over();
+        self.index_map();
         let keyframe = &self.map.keyframes[index];
         self.depth.restart(&keyframe.image, &self.params);
         restore_points(&mut self.depth.active, &keyframe.points);
@@ -109,8 +109,8 @@ impl Mapper {
         self.world_from_map = Self::world_from_map_of(keyframe);
         self.past.clear();
         self.phase = Phase::Mapping;
-        self.enter_keyframe(index);
-        StepOutcome::restored(true)
+        self.activate_keyframe(index);
+        StepOutcome::keyframe_restored(true)
     }
 }
 
@@ -174,7 +174,7 @@ mod tests {
         assert!(second.free_epoch() > unproven);
         let mut with_another_camera = mapper();
         let unproven = second.free_epoch();
-        with_another_camera.succeed(second);
+        with_another_camera.continue_from(second);
         assert_eq!(with_another_camera.free_epoch(), unproven);
     }
 }

@@ -68,7 +68,10 @@ impl Mapper {
         if !is_exact {
             self.anchor(near.keyframe_id, &near.located.keyframe_from_camera);
         }
-        self.take_up(near.index, between(pose.brightness, near.located.brightness));
+        self.switch_active_keyframe(
+            near.index,
+            relative_brightness(pose.brightness, near.located.brightness),
+        );
         true
     }
 
@@ -101,10 +104,15 @@ impl Mapper {
         max_disagreement: f64,
     ) -> Option<NearKeyframe> {
         let present = self.keyframe()?;
-        let map_from_camera = present.map_from_keyframe.place(&pose.keyframe_from_camera);
+        let map_from_camera = present.map_from_keyframe.transform_pose(&pose.keyframe_from_camera);
         let (index, expected) = self.nearest_keyframe(&map_from_camera, max_distance)?;
         let keyframe = self.map.keyframes.get(index)?;
-        let located = self.finder.locate(keyframe, frame.pixels, &expected, max_disagreement)?;
+        let located = self.finder.inverse_transform_pose(
+            keyframe,
+            frame.pixels,
+            &expected,
+            max_disagreement,
+        )?;
         Some(NearKeyframe { index, keyframe_id: keyframe.keyframe_id, located })
     }
 
@@ -130,14 +138,14 @@ impl Mapper {
     }
 
     /// Replaces the active keyframe by that at `index`, whose image has this brightness relative to the active one's.
-    fn take_up(&mut self, index: usize, brightness: Brightness) {
+    fn switch_active_keyframe(&mut self, index: usize, brightness: Brightness) {
         if self.depth.unpublished > 0 {
             self.depth.refine(&self.params);
         }
         self.publish_depth();
         let Some(keyframe) = self.keyframe() else { return };
         let (present_id, present) = (keyframe.keyframe_id, keyframe.map_from_keyframe);
-        self.depth.leave_points(present_id, &self.params);
+        self.depth.keep_mature_points(present_id, &self.params);
         let present_unit = present.scale * self.depth.unit;
         let keyframe = &self.map.keyframes[index];
         let map_from_keyframe = keyframe.map_from_keyframe;
@@ -145,17 +153,17 @@ impl Mapper {
         self.depth.spare.rescale((map_from_keyframe.scale / present_unit) as f32);
         self.depth.restart(&keyframe.image, &self.params);
         let (at, propagation) =
-            (map_from_keyframe.locate(&present.rigid), &self.params.propagation);
-        self.depth.carry(&at, brightness, &self.intrinsics, propagation);
+            (map_from_keyframe.inverse_transform_pose(&present.rigid), &self.params.propagation);
+        self.depth.propagate_spare(&at, brightness, &self.intrinsics, propagation);
         restore_points(&mut self.depth.active, &keyframe.points);
         self.past.clear();
-        self.enter_keyframe(index);
+        self.activate_keyframe(index);
     }
 }
 
 /// Brightness of image 2 relative to image 1, from that of one frame relative to each: with
 /// `I = e^a₁ I₁ + b₁ = e^a₂ I₂ + b₂`, `I₂ = e^(a₁ − a₂) I₁ + e^(−a₂) (b₁ − b₂)`.
-fn between(against_one: Brightness, against_two: Brightness) -> Brightness {
+fn relative_brightness(against_one: Brightness, against_two: Brightness) -> Brightness {
     Brightness {
         a: against_one.a - against_two.a,
         b: (-against_two.a).exp() * (against_one.b - against_two.b),
@@ -203,7 +211,7 @@ mod tests {
                 keyframe_id,
                 world_from_camera: at(claimed),
                 keyframe_from_camera: self.mapper.keyframe().map_or(SE3::identity(), |keyframe| {
-                    keyframe.world_from_keyframe.locate(&at(claimed))
+                    keyframe.world_from_keyframe.inverse_transform_pose(&at(claimed))
                 }),
                 proposes_keyframe: true,
                 ..PoseEstimate::unknown(&frame)
@@ -241,7 +249,9 @@ mod tests {
             let keyframe = walk.mapper.keyframe().unwrap();
             let at = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
             // Exact depth: the keyframe's pose in the map is where it was taken.
-            keyframe.world_from_keyframe.place(&keyframe.map_from_keyframe.locate(&at))
+            keyframe
+                .world_from_keyframe
+                .transform_pose(&keyframe.map_from_keyframe.inverse_transform_pose(&at))
         };
         let is_tracked_or_lost =
             [TrackingState::Tracking, TrackingState::Lost(LostReason::Diverged)];
@@ -304,7 +314,7 @@ mod tests {
         let (one, two) = (Brightness { a: 0.3, b: 5.0 }, Brightness { a: -0.1, b: 2.0 });
         let frame = 0.3f64.exp() * 100.0 + 5.0;
         let expected = (frame - 2.0) / (-0.1f64).exp();
-        let found = between(one, two);
+        let found = relative_brightness(one, two);
         assert!((found.a.exp() * 100.0 + found.b - expected).abs() < 1e-9);
     }
 }

@@ -70,7 +70,7 @@ impl Mapper {
             Phase::Starting => Situation::Starting(self.start.progress),
             Phase::Mapping => self.certainty().map_or(Situation::Mapping, Situation::Localised),
             Phase::Lost(_) | Phase::Restarting(_) if self.is_localising() => {
-                Situation::Localising(self.map.num_held())
+                Situation::Localising(self.map.num_with_depth())
             }
             Phase::Lost(_) => Situation::Lost,
             Phase::Rejected(why, _) => Situation::Rejected(why),

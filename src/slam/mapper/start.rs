@@ -12,12 +12,12 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::keyframe_pose_covariance::UncertainPose;
 use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::phase::Phase;
 use crate::slam::mapper::situation::{StartFrame, StartProgress};
 use crate::slam::mapper::{Mapper, StepInput, StepOutcome};
 use crate::slam::parameter::ParameterError;
-use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::{PoseEstimate, TrackingState, upper_triangle};
 use crate::slam::two_frame::{
     Failure, InitOutcome, InitState, TwoFrameInitializer, TwoFrameParams,
@@ -145,9 +145,9 @@ impl Mapper {
         let scale = self.depth.normalise();
         let map_from_camera = if is_given { pose.world_from_camera } else { origin };
         let epoch = self.free_epoch();
-        let place = UncertainPlace::exact(Sim3::new(map_from_camera, scale));
+        let place = UncertainPose::exact(Sim3::new(map_from_camera, scale));
         self.add_keyframe(frame, &place, epoch);
-        StepOutcome::begun()
+        StepOutcome::map_started()
     }
 
     /// Matching parameters for a frame at `pose`: the less certain the pose, the less certain a match.
@@ -174,7 +174,7 @@ impl Mapper {
         let search_px = USED_SEARCH * f64::from(self.params.matching.max_search_px);
         let baseline = keyframe_from_camera.translation.norm() / self.depth.unit;
         if baseline > 0.0 {
-            self.depth.grow_unit(baseline * focal_px * nearest / search_px);
+            self.depth.scale_unit(baseline * focal_px * nearest / search_px);
         }
     }
 
@@ -196,11 +196,11 @@ impl Mapper {
 
     /// Leaves the active keyframe and starts depth on `pixels`, in a new world.
     fn begin_epoch(&mut self, pixels: &[u8]) {
-        self.leave_keyframe();
+        self.deactivate_keyframe();
         if let Some(left) = self.keyframe() {
             let (keyframe_id, epoch) = (left.keyframe_id, left.epoch);
             self.left_worlds.insert(epoch, self.world_from_map);
-            self.tell_left(keyframe_id);
+            self.queue_keyframe_to_save(keyframe_id);
         }
         self.active = None;
         self.phase = Phase::Mapping;
@@ -233,19 +233,19 @@ impl Mapper {
         self.modes.rescale(scale);
         let first_frame =
             FrameView { sequence: first.0, capture_nanos: first.1, pixels: first_pixels, ..*frame };
-        let place = UncertainPlace::exact(Sim3::new(origin, unit * scale));
+        let place = UncertainPose::exact(Sim3::new(origin, unit * scale));
         self.add_keyframe(&first_frame, &place, epoch);
         // A map starts with two frames in one step.
         self.copies.begin_frame();
         let pose = PoseEstimate {
             epoch,
-            world_from_camera: Sim3::new(origin, unit).place(&start.first_from_current),
+            world_from_camera: Sim3::new(origin, unit).transform_pose(&start.first_from_current),
             keyframe_id: self.next_keyframe_id - 1,
             ..proven_pose(frame, start, scale)
         };
         self.change_keyframe(&StepInput { frame, pose: &pose, sensor_depth: None });
         self.adopt_early_frames(&pose.keyframe_from_camera);
-        StepOutcome { observations, ..StepOutcome::begun() }
+        StepOutcome { observations, ..StepOutcome::map_started() }
     }
 
     /// Observes the depth of the first frame in the one that proves the start.
@@ -262,7 +262,7 @@ impl Mapper {
         let covariance = &start.pose_covariance;
         self.modes.begin(&self.depth.active, &self.intrinsics, &current_from_first, covariance);
         let observations = observe(&mut self.depth.active, &observer, matching, gaussian).counts;
-        self.modes.observed(&self.depth.active, &current_from_first);
+        self.modes.update_after_observation(&self.depth.active, &current_from_first);
         observations
     }
 }

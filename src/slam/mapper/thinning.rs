@@ -22,13 +22,13 @@ const NUM_EXAMINED: usize = 4;
 /// Other keyframes that must show a point: as many as an estimate needs to hold one in place, and one to spare.
 const NUM_OTHERS: usize = 3;
 /// Share of the points that this many others must show.
-const LEAST_SHARE: f64 = 0.9;
+const MIN_SHARE: f64 = 0.9;
 /// Points that are checked: they determine the share to 0.02.
-const MOST_POINTS: usize = 256;
+const MAX_CHECKED_POINTS: usize = 256;
 /// Another keyframe shows a point as well if it is at most this many times as far from it.
-const MOST_DISTANCE_RATIO: f64 = 1.25;
+const MAX_DISTANCE_RATIO: f64 = 1.25;
 /// Least cosine of the angle between their directions to it, 20°: beyond, alignment meets different texture.
-const LEAST_COSINE: f64 = 0.94;
+const MIN_COSINE: f64 = 0.94;
 /// Keyframes further away than this many mean depths see common points from other directions.
 const REACH: f64 = 0.5;
 
@@ -53,7 +53,7 @@ impl Thinning {
         extended.keyframes.extend(self.attached.iter().filter_map(|(&id, to)| {
             let (was, keyframe) = (map.get(*to)?, map.get(id)?);
             let by = *places.get(to)? * was.map_from_keyframe.inverse();
-            Some(KeyframeCorrection::of_place(id, by * keyframe.map_from_keyframe))
+            Some(KeyframeCorrection::of_pose(id, by * keyframe.map_from_keyframe))
         }));
         extended
     }
@@ -134,7 +134,7 @@ fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<u64> {
         return None;
     }
     let views: Vec<Sim3> = others.iter().map(|of| of.map_from_keyframe.inverse() * place).collect();
-    let stride = keyframe.points.len().div_ceil(MOST_POINTS).max(1);
+    let stride = keyframe.points.len().div_ceil(MAX_CHECKED_POINTS).max(1);
     let (mut shown, mut all) = (0u32, 0u32);
     for point in keyframe.points.iter().step_by(stride) {
         let ray = keyframe.intrinsics.ray(f64::from(point.u), f64::from(point.v));
@@ -144,13 +144,13 @@ fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<u64> {
         shown += u32::from(num_showing >= NUM_OTHERS);
         all += 1;
     }
-    if f64::from(shown) < LEAST_SHARE * f64::from(all) {
+    if f64::from(shown) < MIN_SHARE * f64::from(all) {
         return None;
     }
     // A camera that returns here must find another keyframe to be tracked on, measured by that one's unit and points as
     // reuse does: otherwise the path back is mapped anew, and drifts.
     let stands_in = |of: &Keyframe| {
-        let at = of.map_from_keyframe.locate(&place.rigid);
+        let at = of.map_from_keyframe.inverse_transform_pose(&place.rigid);
         reuse.distance.distance(at.translation.norm(), of.usage(&at)) < reuse.max_distance
     };
     let nearest = others.iter().filter(|of| stands_in(of)).min_by(|one, other| {
@@ -166,8 +166,8 @@ fn shows(keyframe: &Keyframe, view: &Sim3, at: &Vector3<f64>) -> bool {
     let from_other = seen - view.rigid.translation;
     let (distance, other) = (seen.norm(), from_other.norm());
     if seen.z <= 0.0
-        || distance > MOST_DISTANCE_RATIO * other
-        || seen.dot(&from_other) < LEAST_COSINE * distance * other
+        || distance > MAX_DISTANCE_RATIO * other
+        || seen.dot(&from_other) < MIN_COSINE * distance * other
     {
         return false;
     }
@@ -186,7 +186,7 @@ mod tests {
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Matrix7;
     use crate::slam::keyframe::{DepthPoint, DistanceWeights};
-    use crate::slam::loops::known::{KnownLoops, Link};
+    use crate::slam::loops::record::{Link, LoopRecord};
     use crate::slam::mapper::MapperParams;
     use crate::slam::mapper::phase::Active;
     use crate::slam::test_scene::CAMERA;
@@ -290,11 +290,11 @@ mod tests {
     fn repeated_rounds_keep_only_as_many_keyframes_as_the_places_need() {
         let mut mapper = mapper(12, 30);
         mapper.map.loops =
-            Arc::new(KnownLoops { links: vec![loop_between(7, 12)], ..Default::default() });
+            Arc::new(LoopRecord { links: vec![loop_between(7, 12)], ..Default::default() });
         for _ in 0..200 {
             mapper.thin();
         }
-        let held = mapper.map.num_held();
+        let held = mapper.map.num_with_depth();
         assert!((30..=60).contains(&held), "{held} of 120");
         let has_depth = |id: usize| mapper.map.keyframes[id].has_depth();
         assert!(has_depth(7) && has_depth(12), "keyframes with a loop");
@@ -303,7 +303,7 @@ mod tests {
         // A map within the limit is left unchanged.
         let mut small = self::mapper(12, 120);
         small.thin();
-        assert_eq!(small.map.num_held(), 120);
+        assert_eq!(small.map.num_with_depth(), 120);
     }
 
     #[test]
@@ -318,7 +318,7 @@ mod tests {
                 SE3::exp(&(Vector6::repeat(1e-3) * of.keyframe_id as f64)),
                 1.0 + 1e-3 * of.keyframe_id as f64,
             );
-            KeyframeCorrection::of_place(of.keyframe_id, by * of.map_from_keyframe)
+            KeyframeCorrection::of_pose(of.keyframe_id, by * of.map_from_keyframe)
         };
         let keyframes = mapper.map.keyframes.iter().map(by_its_own).collect();
         mapper.apply(&Correction { keyframes, ..Correction::default() }).unwrap();
@@ -326,10 +326,10 @@ mod tests {
         let moved = Sim3::new(SE3::exp(&[0.3, -0.1, 0.2, 0.1, 0.4, -0.2].into()), 1.3);
         let held = mapper.map.keyframes.iter().filter(|of| of.has_depth());
         let keyframes = held
-            .map(|of| KeyframeCorrection::of_place(of.keyframe_id, moved * of.map_from_keyframe));
+            .map(|of| KeyframeCorrection::of_pose(of.keyframe_id, moved * of.map_from_keyframe));
         let correction = Correction { keyframes: keyframes.collect(), ..Correction::default() };
         let before = mapper.map.clone();
-        assert!(before.num_held() < before.keyframes.len());
+        assert!(before.num_with_depth() < before.keyframes.len());
         mapper.apply(&correction).unwrap();
         for (was, is) in before.keyframes.iter().zip(&mapper.map.keyframes) {
             let expected = moved * was.map_from_keyframe;
@@ -352,7 +352,7 @@ mod tests {
         for moved in [&[0, 1][..], &[2]] {
             let of_place = |&id: &u64| {
                 let of = mapper.map.get(id).unwrap();
-                KeyframeCorrection::of_place(id, by * of.map_from_keyframe)
+                KeyframeCorrection::of_pose(id, by * of.map_from_keyframe)
             };
             let keyframes = moved.iter().map(of_place).collect();
             mapper.apply(&Correction { keyframes, ..Correction::default() }).unwrap();

@@ -41,7 +41,7 @@ impl TurnedViews {
         const STEPS: i32 = 4;
         const STEP_DEG: f64 = 9.0;
         /// Pixels of the keyframe's image that the camera must see: below a quarter, similarity arises by chance.
-        const LEAST_SEEN: usize = COUNT / 4;
+        const MIN_SEEN: usize = COUNT / 4;
         let mut views = Self { camera: *camera, rotations: Vec::new(), pixels: Vec::new() };
         let about = |axis, angle| UnitQuaternion::from_axis_angle(&axis, angle);
         let step = |k: i32| STEP_DEG.to_radians() * f64::from(k);
@@ -57,7 +57,7 @@ impl TurnedViews {
                     .pixels
                     .extend((0..COUNT).map(|pixel| seen_at(camera, &camera_from_keyframe, pixel)));
                 let seen = views.pixels[begin..].iter().filter(|&&at| at != OUTSIDE).count();
-                match seen >= LEAST_SEEN {
+                match seen >= MIN_SEEN {
                     true => views.rotations.push(rotation),
                     false => views.pixels.truncate(begin),
                 }
@@ -105,14 +105,14 @@ impl TurnedViews {
 /// The camera's pixel that sees a distant point at a pixel of the keyframe.
 fn seen_at(camera: &Intrinsics, camera_from_keyframe: &Rotation3<f64>, pixel: usize) -> u16 {
     /// Least cosine between a ray and the optical axis: below it a view is stretched without limit.
-    const LEAST_COSINE: f64 = 0.2;
+    const MIN_COSINE: f64 = 0.2;
     let scale_u = camera.width as f64 / COLUMNS as f64;
     let scale_v = camera.height as f64 / ROWS as f64;
     let u = ((pixel % COLUMNS) as f64 + 0.5) * scale_u - 0.5;
     let v = ((pixel / COLUMNS) as f64 + 0.5) * scale_v - 0.5;
     let ray = camera.ray(u, v);
     let ray = camera_from_keyframe * ray.normalize();
-    if !(ray.z > LEAST_COSINE) {
+    if !(ray.z > MIN_COSINE) {
         return OUTSIDE;
     }
     let column = ((camera.fx * ray.x / ray.z + camera.cx + 0.5) / scale_u).floor();
@@ -140,12 +140,14 @@ fn sums(keyframe: &[f32], frame: &[f32; COUNT], mask: &[f32; COUNT]) -> [f32; 3]
 /// nothing to compare.
 fn score(common: f32, [ours, theirs]: [f32; 2], count: f32) -> Option<f32> {
     /// Variance of the details, grey levels², up to which an image shows nothing.
-    const LEAST_VARIANCE: f32 = 0.05;
+    const MIN_VARIANCE: f32 = 0.05;
     /// Limits a perfect correlation against rounding.
-    const MOST: f32 = 0.999;
-    let least = LEAST_VARIANCE * count;
-    (ours > least && theirs > least)
-        .then(|| (common / (ours * theirs).sqrt()).clamp(-MOST, MOST).atanh() * count.sqrt())
+    const MAX_CORRELATION: f32 = 0.999;
+    let least = MIN_VARIANCE * count;
+    (ours > least && theirs > least).then(|| {
+        (common / (ours * theirs).sqrt()).clamp(-MAX_CORRELATION, MAX_CORRELATION).atanh()
+            * count.sqrt()
+    })
 }
 
 #[cfg(test)]

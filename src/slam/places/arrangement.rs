@@ -16,7 +16,7 @@ pub(super) struct Match {
 }
 
 /// Maximum number of matches that propose an arrangement, the best first.
-const MOST_PROPOSALS: usize = 40;
+const MAX_PROPOSALS: usize = 40;
 /// Largest offset of a match from an arrangement, shares of the image's width: allows for depth seen from the side.
 const MAX_SHIFT: f32 = 0.1;
 /// Steps of orientation and of scale by which a match may differ.
@@ -40,7 +40,7 @@ pub(super) struct Arrangement {
 /// The arrangement that most matches agree on, of one keyframe and each for another of our features, the best first;
 /// `None` without matches.
 pub(super) fn arrange(pairs: &[(FeaturePlace, FeaturePlace)], width: f32) -> Option<Arrangement> {
-    let proposals = pairs.iter().take(MOST_PROPOSALS);
+    let proposals = pairs.iter().take(MAX_PROPOSALS);
     let rated = proposals.map(|proposal| {
         let agrees = agreement(proposal, width);
         (pairs.iter().filter(|pair| agrees(pair)).count(), proposal)

@@ -5,7 +5,7 @@ use std::cmp::Reverse;
 
 use super::corners::{Corner, CornerFinder};
 use super::pattern::{ORIENTATIONS, Pattern, RADIUS_PX, WORDS};
-use super::scales::{self, MOST_SCALES, Scale};
+use super::scales::{self, MAX_SCALES, Scale};
 
 /// Maximum number of features of an image.
 pub const MAX_FEATURES: usize = 200;
@@ -51,7 +51,7 @@ impl Description {
             usize::from(place.u) < width
                 && usize::from(place.v) < height
                 && usize::from(place.orientation) < ORIENTATIONS
-                && usize::from(place.scale) < MOST_SCALES
+                && usize::from(place.scale) < MAX_SCALES
         };
         let is_some = (1..=MAX_FEATURES).contains(&features.len());
         let (width, height) = (u16::try_from(width), u16::try_from(height));
@@ -80,8 +80,8 @@ impl Describer {
     /// Describes an image, given row by row; `None` where it is too small, or shows nothing.
     pub fn describe(&mut self, pixels: &[u8], width: usize, height: usize) -> Option<Description> {
         /// Least side of a scale.
-        const LEAST_PX: usize = 72;
-        let is_sized = |side: usize| (LEAST_PX..=usize::from(u16::MAX)).contains(&side);
+        const MIN_SIDE_PX: usize = 72;
+        let is_sized = |side: usize| (MIN_SIDE_PX..=usize::from(u16::MAX)).contains(&side);
         if !is_sized(width) || !is_sized(height) || pixels.len() != width * height {
             return None;
         }
@@ -102,7 +102,7 @@ impl Describer {
             for threshold in THRESHOLDS {
                 let Scale { pixels, width, height, .. } = scale;
                 self.finder.find(pixels, *width, *height, MARGIN_PX, threshold, &mut self.corners);
-                if self.corners.len() >= LEAST_CORNERS * budget {
+                if self.corners.len() >= MIN_CORNERS * budget {
                     break;
                 }
             }
@@ -121,7 +121,7 @@ impl Describer {
 /// above the noise of a small sensor.
 const THRESHOLDS: [u8; 2] = [24, 8];
 /// Corners that are enough to choose from, as a multiple of those wanted.
-const LEAST_CORNERS: usize = 3;
+const MIN_CORNERS: usize = 3;
 /// Pixels that a descriptor needs to the edge.
 const MARGIN_PX: usize = RADIUS_PX as usize + 1;
 
@@ -130,13 +130,13 @@ fn choose(corners: &mut [Corner], scale: &Scale, budget: usize, chosen: &mut Vec
     /// Cells of the image that share the corners.
     const PARTS: [usize; 2] = [8, 6];
     /// Most corners of a cell, as a multiple of its share.
-    const MOST_SHARES: usize = 3;
+    const MAX_CELL_SHARES: usize = 3;
     /// Strongest corners that are considered, as a multiple of those wanted.
-    const MOST_CONSIDERED: usize = 10;
-    let most = (MOST_SHARES * budget).div_ceil(PARTS[0] * PARTS[1]);
+    const MAX_CONSIDERED: usize = 10;
+    let most = (MAX_CELL_SHARES * budget).div_ceil(PARTS[0] * PARTS[1]);
     let mut counts = [0usize; PARTS[0] * PARTS[1]];
     let strongest = |corner: &Corner| (Reverse(corner.strength), corner.v, corner.u);
-    let few = MOST_CONSIDERED * budget;
+    let few = MAX_CONSIDERED * budget;
     let corners = match corners.len() > few && few > 0 {
         true => corners.select_nth_unstable_by_key(few, strongest).0,
         false => corners,

@@ -14,7 +14,7 @@ const MAX_DISTANCE: u32 = 50;
 /// Number of leaves searched for a feature.
 const LEAVES: usize = 4;
 /// Keyframes with most matches whose arrangement is examined.
-const MOST_ARRANGED: usize = 30;
+const MAX_ARRANGED: usize = 30;
 
 /// A keyframe that may show the same place as an image.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -150,7 +150,7 @@ impl PlaceIndex {
         let mut ranked: Vec<u32> =
             (0..votes.len() as u32).filter(|&slot| votes[slot as usize] > 0).collect();
         ranked.sort_by_key(|&slot| std::cmp::Reverse((votes[slot as usize], slot)));
-        ranked.truncate(MOST_ARRANGED);
+        ranked.truncate(MAX_ARRANGED);
         let mut found: Vec<(Arrangement, u32)> = ranked
             .into_iter()
             .filter_map(|slot| {

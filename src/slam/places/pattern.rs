@@ -48,7 +48,7 @@ fn upright() -> Vec<[[f64; 2]; 2]> {
     /// Standard deviation of either coordinate: a fifth of the patch.
     const SCATTER_PX: f64 = 6.2;
     /// Shorter pairs measure noise.
-    const LEAST_LENGTH_PX: f64 = 4.0;
+    const MIN_LENGTH_PX: f64 = 4.0;
     let mut state = 1u64;
     let mut uniform = move || {
         // SplitMix64 (Steele, Lea, Flood 2014).
@@ -64,7 +64,7 @@ fn upright() -> Vec<[[f64; 2]; 2]> {
     while pairs.len() < BITS {
         let [a, b] = std::array::from_fn(|_| [coordinate(), coordinate()]);
         let is_inside = |[x, y]: [f64; 2]| x.hypot(y) <= f64::from(RADIUS_PX) - 0.5;
-        if is_inside(a) && is_inside(b) && (a[0] - b[0]).hypot(a[1] - b[1]) >= LEAST_LENGTH_PX {
+        if is_inside(a) && is_inside(b) && (a[0] - b[0]).hypot(a[1] - b[1]) >= MIN_LENGTH_PX {
             pairs.push([a, b]);
         }
     }

@@ -27,8 +27,7 @@ pub(super) fn fill(
     let first = (long as f32 / LARGEST_PX as f32).max(1.0);
     let of = |k: usize| first * SCALE_STEP.powi(k as i32);
     let sized = |side: usize, k: usize| (side as f32 / of(k)).round() as usize;
-    let count =
-        (0..MOST_SCALES).take_while(|&k| sized(width.min(height), k) >= SMALLEST_PX).count();
+    let count = (0..MAX_SCALES).take_while(|&k| sized(width.min(height), k) >= SMALLEST_PX).count();
     scales.resize_with(count, Scale::default);
     for k in 0..count {
         let (before, rest) = scales.split_at_mut(k);
@@ -52,7 +51,7 @@ pub(super) fn fill(
 /// Longer side of the largest scale: finer detail is noise and compression.
 const LARGEST_PX: usize = 512;
 /// Maximum number of scales of an image.
-pub(super) const MOST_SCALES: usize = 7;
+pub(super) const MAX_SCALES: usize = 7;
 /// Shorter side of the smallest: two descriptors side by side.
 const SMALLEST_PX: usize = 72;
 

@@ -6,9 +6,9 @@ use super::pattern::{BITS, WORDS};
 /// Number of entries beyond which a leaf is split.
 const SPLIT_AT: usize = 48;
 /// Maximum number of entries of a leaf that no bit splits: more identical ones add nothing.
-const MOST_IN_LEAF: usize = 4 * SPLIT_AT;
+const MAX_IN_LEAF: usize = 4 * SPLIT_AT;
 /// Least share of the entries on the smaller side of a split.
-const LEAST_SHARE: f32 = 0.1;
+const MIN_SHARE: f32 = 0.1;
 
 /// A descriptor and its owner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -48,7 +48,7 @@ impl Tree {
             return;
         }
         let Some(bit) = best_bit(entries) else {
-            if entries.len() < MOST_IN_LEAF {
+            if entries.len() < MAX_IN_LEAF {
                 entries.push(entry);
             }
             return;
@@ -80,10 +80,10 @@ impl Tree {
         most: usize,
         visit: &mut impl FnMut(&[Entry]),
     ) {
-        let mut others: [u32; MOST_LEAVES] = [0; MOST_LEAVES];
+        let mut others: [u32; MAX_LEAVES] = [0; MAX_LEAVES];
         let mut known = 0;
         let mut at = 0;
-        let most = most.min(MOST_LEAVES);
+        let most = most.min(MAX_LEAVES);
         for visited in 0..most {
             loop {
                 match &self.nodes[at] {
@@ -181,7 +181,7 @@ impl Tree {
 }
 
 /// Maximum number of leaves that are visited for one descriptor.
-pub(super) const MOST_LEAVES: usize = 16;
+pub(super) const MAX_LEAVES: usize = 16;
 
 fn has(bits: &[u64; WORDS], bit: u16) -> bool {
     bits[usize::from(bit) / 64] >> (bit % 64) & 1 == 1
@@ -199,7 +199,7 @@ fn best_bit(entries: &[Entry]) -> Option<u16> {
     }
     let smaller = |k: usize| counts[k].min(entries.len() - counts[k]);
     let best = (0..BITS).max_by_key(|&k| (smaller(k), std::cmp::Reverse(k)))?;
-    (smaller(best) as f32 >= LEAST_SHARE * entries.len() as f32).then_some(best as u16)
+    (smaller(best) as f32 >= MIN_SHARE * entries.len() as f32).then_some(best as u16)
 }
 
 /// Number of bits that differ.
@@ -260,7 +260,7 @@ mod tests {
         assert!(!found(&tree, &turned, &unsure, 1).contains(&0));
         let leaf = found(&tree, &turned, &[u64::MAX; WORDS], 1).len();
         assert!(
-            found(&tree, &turned, &[u64::MAX; WORDS], 99).len() <= MOST_LEAVES * SPLIT_AT.max(leaf)
+            found(&tree, &turned, &[u64::MAX; WORDS], 99).len() <= MAX_LEAVES * SPLIT_AT.max(leaf)
         );
     }
 
@@ -268,7 +268,7 @@ mod tests {
     fn identical_descriptors_are_kept_only_a_few_times() {
         let mut tree = Tree::default();
         (0..1_000).for_each(|slot| tree.insert(Entry { bits: [7; WORDS], slot, feature: 0 }));
-        assert_eq!(found(&tree, &[7; WORDS], &[0; WORDS], 1).len(), MOST_IN_LEAF);
+        assert_eq!(found(&tree, &[7; WORDS], &[0; WORDS], 1).len(), MAX_IN_LEAF);
         tree.retain(|entry| entry.slot == 3);
         assert_eq!(found(&tree, &[7; WORDS], &[0; WORDS], 1), [3]);
     }

@@ -37,7 +37,7 @@ impl Motion {
             return;
         }
         if let Some((_, last)) = &mut self.last {
-            *last = after.place(&before.locate(last));
+            *last = after.transform_pose(&before.inverse_transform_pose(last));
         }
         if let Some((twist, _)) = &mut self.velocity {
             let factor = after.scale / before.scale;
@@ -114,7 +114,7 @@ pub fn hypotheses(motion: &Motion, nanos: i64, rotation_rad: f64) -> impl Iterat
 
 /// A camera's pose unchanged, panned and tilted by `rotation_rad` either way and both, and rolled: the views from which
 /// a coarse alignment finds any viewing direction near it.
-pub fn turned(world_from_camera: &SE3, rotation_rad: f64) -> impl Iterator<Item = SE3> {
+pub fn rotations_around(world_from_camera: &SE3, rotation_rad: f64) -> impl Iterator<Item = SE3> {
     /// (tilt, pan, roll) in units of the rotation.
     const TURNS: [[f64; 3]; 11] = [
         [0.0, 0.0, 0.0],
@@ -163,8 +163,8 @@ mod tests {
         let relative = [pose([0.0; 6]), pose([0.1, 0.0, 0.02, 0.01, -0.03, 0.02])];
         let seen_from = |keyframe: &Sim3| {
             let mut motion = Motion::default();
-            motion.observe(0, &keyframe.place(&relative[0]));
-            motion.observe(33, &keyframe.place(&relative[1]));
+            motion.observe(0, &keyframe.transform_pose(&relative[0]));
+            motion.observe(33, &keyframe.transform_pose(&relative[1]));
             motion
         };
         let mut moved = seen_from(&before);

@@ -17,20 +17,22 @@ use crate::slam::tracker::velocity::PoseErrors;
 use crate::slam::tracker::verdict::quality_of;
 
 /// Pose of the camera.
-struct Placed {
+struct CameraPose {
     keyframe_from_camera: SE3,
     world_from_camera: SE3,
     map_from_camera: SE3,
 }
 
-impl Placed {
+impl CameraPose {
     /// The pose found by `alignment`.
     fn of(reference: &Reference, alignment: &Alignment) -> Self {
         let keyframe_from_camera = alignment.state.current_from_keyframe.inverse();
         Self {
             keyframe_from_camera,
-            world_from_camera: reference.world_from_keyframe().place(&keyframe_from_camera),
-            map_from_camera: reference.map_from_keyframe().place(&keyframe_from_camera),
+            world_from_camera: reference
+                .world_from_keyframe()
+                .transform_pose(&keyframe_from_camera),
+            map_from_camera: reference.map_from_keyframe().transform_pose(&keyframe_from_camera),
         }
     }
 
@@ -49,7 +51,7 @@ impl Tracker {
         missing: u64,
     ) -> PoseEstimate {
         let quality = self.quality(alignment);
-        let placed = Placed::of(reference, alignment);
+        let placed = CameraPose::of(reference, alignment);
         let (nanos, world_from_camera) = (frame.capture_nanos, &placed.world_from_camera);
         if self.contradicts_hold(nanos, world_from_camera) {
             return self.lost(frame, reference, LostReason::TooFewInliers, quality);
@@ -80,11 +82,11 @@ impl Tracker {
         &mut self,
         reference: &Reference,
         alignment: &Alignment,
-        placed: &Placed,
+        placed: &CameraPose,
         covariance: &Matrix6<f64>,
         unclaimed: PoseEstimate,
     ) -> PoseEstimate {
-        let Placed { keyframe_from_camera, world_from_camera, map_from_camera } = *placed;
+        let CameraPose { keyframe_from_camera, world_from_camera, map_from_camera } = *placed;
         let PoseEstimate { state, quality, .. } = unclaimed;
         let displacement = displacement_covariance(
             quality.displacement_px,
@@ -94,7 +96,7 @@ impl Tracker {
         let published = covariance
             + alignment.covariance_from_modes(reference).unwrap_or_default()
             + displacement;
-        let in_map = reference.uncertain_place().of_camera(&keyframe_from_camera, &published);
+        let in_map = reference.uncertain_pose().of_camera(&keyframe_from_camera, &published);
         let errors = PoseErrors {
             keyframe: (reference.keyframe_id(), reference.epoch()),
             unit: reference.world_from_keyframe().scale,
@@ -134,9 +136,9 @@ impl Tracker {
     /// Whether the keyframe's mean grey value appears brighter or darker in a frame by more than the limit.
     fn has_other_light(&self, reference: &Reference, brightness: &Brightness) -> bool {
         /// Below a few grey levels the ratio is noise.
-        const LEAST_GREY: f64 = 5.0;
-        let in_keyframe = reference.mean_grey().max(LEAST_GREY);
-        let in_frame = (brightness.a.exp() * in_keyframe + brightness.b).max(LEAST_GREY);
+        const MIN_GREY: f64 = 5.0;
+        let in_keyframe = reference.mean_grey().max(MIN_GREY);
+        let in_frame = (brightness.a.exp() * in_keyframe + brightness.b).max(MIN_GREY);
         (in_frame / in_keyframe).ln().abs() > self.params.keyframe_brightness_ratio.ln()
     }
 
@@ -154,11 +156,11 @@ impl Tracker {
     /// as after a loss. The last points at the edge of a view fit nearly anything.
     fn has_jumped(&self, reference: &Reference, nanos: i64, world_from_camera: &SE3) -> bool {
         /// Largest change of the rotation from one frame to the next at 30 Hz, radians: 9°.
-        const MOST_ROTATION_RAD: f64 = 0.15;
+        const MAX_ROTATION_RAD: f64 = 0.15;
         /// The same of the translation, in mean depths.
-        const MOST_TRANSLATION: f64 = 0.15;
+        const MAX_TRANSLATION: f64 = 0.15;
         /// Share of its last step by which a fast camera may brake or turn in one frame.
-        const MOST_OF_STEP: f64 = 0.5;
+        const MAX_STEP_CHANGE_RATIO: f64 = 0.5;
         let motion = &self.memory.motion;
         let (Some((intervals, step)), Some(predicted)) =
             (motion.step(nanos), motion.predict(nanos, 1.0))
@@ -167,9 +169,10 @@ impl Tracker {
         };
         let off = predicted.inverse() * *world_from_camera;
         let mean_depth = reference.world_from_keyframe().scale / reference.mean_inverse_depth();
-        let most = |least: f64, of_step: f64| (least * intervals).max(MOST_OF_STEP * of_step);
-        off.rotation.angle() > most(MOST_ROTATION_RAD, step.rotation.angle())
-            || off.translation.norm() > most(MOST_TRANSLATION * mean_depth, step.translation.norm())
+        let most =
+            |least: f64, of_step: f64| (least * intervals).max(MAX_STEP_CHANGE_RATIO * of_step);
+        off.rotation.angle() > most(MAX_ROTATION_RAD, step.rotation.angle())
+            || off.translation.norm() > most(MAX_TRANSLATION * mean_depth, step.translation.norm())
     }
 
     /// The estimate of a frame that could not be aligned: repeats the last pose, not claimed.
@@ -198,12 +201,14 @@ impl Tracker {
     ) -> PoseEstimate {
         let world_from_camera = self.memory.motion.last().unwrap_or_else(SE3::identity);
         let located = reference
-            .map(|reference| reference.world_from_keyframe().locate(&world_from_camera))
+            .map(|reference| {
+                reference.world_from_keyframe().inverse_transform_pose(&world_from_camera)
+            })
             // Not finite where the keyframe's unit is absurdly small.
             .filter(SE3::is_finite);
         let keyframe_from_camera = located.unwrap_or_else(SE3::identity);
         let placed = reference
-            .map(|reference| reference.map_from_keyframe().place(&keyframe_from_camera))
+            .map(|reference| reference.map_from_keyframe().transform_pose(&keyframe_from_camera))
             .filter(SE3::is_finite);
         let unknown = upper_triangle(|row, column| match row == column {
             true => UNKNOWN_VARIANCE,

@@ -9,7 +9,9 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix, UncertainPlace};
+use crate::slam::keyframe_pose_covariance::{
+    KeyframePoseCovariance, KeyframePoseMatrix, UncertainPose,
+};
 use crate::slam::pose::full_covariance;
 use crate::slam::pose::{
     DegradedReason, LostReason, PoseEstimate, TrackingState, UNKNOWN_VARIANCE,
@@ -78,14 +80,14 @@ fn the_covariance_in_the_map_combines_those_of_the_keyframe_and_of_the_pose_on_i
     let estimate = |deviation: f64| {
         let mut keyframe = plane.keyframe(&camera, 2, 0.02);
         keyframe.map_from_keyframe = Sim3::new(path(30), 0.5);
-        let place = PlaceMatrix::from_diagonal_element(deviation * deviation);
-        keyframe.place_covariance = PlaceCovariance::bounded(&place);
+        let place = KeyframePoseMatrix::from_diagonal_element(deviation * deviation);
+        keyframe.place_covariance = KeyframePoseCovariance::bounded(&place);
         tracker_on(&keyframe).track(&frame(0, &image), &mut always)
     };
     let (exact, uncertain) = (estimate(0.0), estimate(0.1));
     assert_eq!(exact.covariance, uncertain.covariance);
     let matrices = [&exact.map_covariance, &uncertain.map_covariance].map(full_covariance);
-    let place = UncertainPlace::exact(Sim3::new(path(30), 0.5));
+    let place = UncertainPose::exact(Sim3::new(path(30), 0.5));
     let of_pose = place.of_camera(&exact.keyframe_from_camera, &full_covariance(&exact.covariance));
     assert!((matrices[0] - of_pose).norm() < 1e-12 * of_pose.norm(), "{}", matrices[0]);
     // The pose on the keyframe does not rotate the increment of the keyframe's pose, but the unit moves the camera.

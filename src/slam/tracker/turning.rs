@@ -22,7 +22,7 @@ use crate::slam::pose::{
 };
 use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::tracker::verdict::quality_of;
-use crate::slam::tracker::{MOST_DEVIATIONS, Memory, Tracker};
+use crate::slam::tracker::{MAX_POSE_DEVIATIONS, Memory, Tracker};
 
 /// Change of the exposure since the view: of the logarithm of the gain, and of the offset in grey levels. Only a few
 /// frames pass; more freedom flattens a view of little contrast until it fits anything.
@@ -30,21 +30,21 @@ const GAIN_STD_DEV: f64 = 0.05;
 const OFFSET_STD_DEV: f64 = 5.0;
 
 /// Least number of points of the view that a frame must show, at the finest level.
-const FEWEST_POINTS: u32 = 500;
+const MIN_POINTS: u32 = 500;
 
 /// Largest standard deviation of the rotation from the view, radians: 3°, as far as the next alignment converges.
-const MOST_ROTATION_STD_DEV: f64 = 0.05;
+const MAX_ROTATION_STD_DEV: f64 = 0.05;
 
 /// Largest logarithm of the gain, either way, with which a frame is held: a blurred frame has that much less contrast
 /// than a sharp one.
-const MOST_GAIN: f64 = 0.7;
+const MAX_LOG_GAIN: f64 = 0.7;
 
 /// Largest change of the rotation from one frame to the next, radians, once it is held: 9° at 30 Hz are an angular
 /// acceleration that hands do not reach.
-const MOST_CHANGE_RAD: f64 = 0.15;
+const MAX_CHANGE_RAD: f64 = 0.15;
 
 /// Least share of the points compared that the rotation must explain by image noise alone.
-const LEAST_INLIERS: f64 = 0.8;
+const MIN_INLIERS: f64 = 0.8;
 
 /// Speed of a hand-held camera, mean depths per second: a standard deviation. Frames are expected at that distance from
 /// the view; the images of a rotating camera hardly distinguish a translation from a rotation.
@@ -54,8 +54,8 @@ const SPEED: f64 = 0.3;
 const TIGHTNESS: f64 = 0.5;
 /// Bounds of the time since the view to which this applies: that of the fastest camera, and the longest after which the
 /// camera may be anywhere. Beyond it no view is kept either.
-const LEAST_SECONDS: f64 = 0.001;
-const MOST_SECONDS: f64 = 1.0;
+const MIN_SECONDS: f64 = 0.001;
+const MAX_SECONDS: f64 = 1.0;
 
 /// Largest displacement of a frame that was cut short, pixels of the finest level: beyond that fewer of its points
 /// would be explained by noise.
@@ -63,7 +63,7 @@ const CUT_SHORT_PX: f64 = 1.0;
 
 /// How long a view may hold the camera although it has not rotated away from the keyframe, seconds: as long as the blur
 /// of a jerk lasts. If it stays hidden for longer this is not a rotation, and the mapper starts to count the loss.
-const MOST_IN_VIEW_SECS: f64 = 0.5;
+const MAX_IN_VIEW_SECS: f64 = 0.5;
 
 /// Share of the keyframe's points in view below which the view is prepared ahead: a camera that pans at 90°/s loses a
 /// twentieth of its image per frame, and from a third to a tenth on there is too little depth.
@@ -77,7 +77,7 @@ pub(super) struct Turning {
     aligner: Aligner,
     /// Taken out while a frame is aligned to it.
     view: Option<Box<Reference>>,
-    place: Option<Place>,
+    place: Option<ViewPose>,
     /// Whether no frame has been held to it yet: the motion is that from the keyframe's last points.
     is_first: bool,
     /// Fit of the last held frame on the coarsest level.
@@ -99,14 +99,14 @@ struct Frames {
 }
 
 /// State that is saved while a frame is rehearsed.
-pub(super) struct Paused {
-    place: Option<Place>,
+pub(super) struct SavedView {
+    place: Option<ViewPose>,
     frames: Frames,
 }
 
 /// Pose of the view.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Place {
+pub(super) struct ViewPose {
     /// In units of the mean depth.
     world_from_view: Sim3,
     /// Time from the last frame tracked on the keyframe to the view, seconds.
@@ -121,7 +121,7 @@ pub(super) struct Place {
     covariance: Matrix6<f64>,
 }
 
-impl Place {
+impl ViewPose {
     /// Variance of the camera's distance from here at `since_secs`. It moves evenly: the distance grows with the time,
     /// not with its square root.
     fn distance_variance(&self, since_secs: f64) -> f64 {
@@ -185,24 +185,24 @@ impl Turning {
     }
 
     /// Saves the state before a frame is rehearsed: nothing is held meanwhile.
-    pub(super) fn pause(&mut self) -> Paused {
-        Paused { place: self.place.take(), frames: std::mem::take(&mut self.frames) }
+    pub(super) fn pause(&mut self) -> SavedView {
+        SavedView { place: self.place.take(), frames: std::mem::take(&mut self.frames) }
     }
 
     /// Restores the state afterwards: `pyramid` was filled once more.
-    pub(super) fn resume(&mut self, paused: Paused, pyramid: &mut SumPyramid) {
+    pub(super) fn resume(&mut self, paused: SavedView, pyramid: &mut SumPyramid) {
         std::mem::swap(&mut self.before, pyramid);
         (self.place, self.frames) = (paused.place, paused.frames);
         self.is_due = false;
     }
 
     /// Makes the frame of `estimate` the next view.
-    fn take_over(&mut self, estimate: &PoseEstimate, place: Place) {
+    fn set_view(&mut self, estimate: &PoseEstimate, place: ViewPose) {
         self.is_first = false;
         // Consecutive frames are blurred alike, and show nearly the same.
         self.is_due = true;
         let world_from_view = Sim3::new(estimate.world_from_camera, place.world_from_view.scale);
-        self.place = Some(Place { world_from_view, nanos: estimate.capture_nanos, ..place });
+        self.place = Some(ViewPose { world_from_view, nanos: estimate.capture_nanos, ..place });
     }
 
     /// Ends the hold as the keyframe fits again, or nothing does; returns whether a view was held.
@@ -234,26 +234,27 @@ impl Tracker {
         }
         let place = self.turning.place?;
         let mut view = self.turning.view.take()?;
-        let lost = self.recall(before);
+        let lost = self.restore_memory(before);
         let since_view = frame.capture_nanos.saturating_sub(place.nanos) as f64 * 1e-9;
-        let step = since_view.clamp(LEAST_SECONDS, MOST_SECONDS);
-        view.stand_at(&place.world_from_view, TIGHTNESS * place.speed * step);
-        let mut next = Place { since_secs: place.since_secs + step, ..place };
+        let step = since_view.clamp(MIN_SECONDS, MAX_SECONDS);
+        view.place_view(&place.world_from_view, TIGHTNESS * place.speed * step);
+        let mut next = ViewPose { since_secs: place.since_secs + step, ..place };
         let distance_variance = place.distance_variance(next.since_secs);
         std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
         let (alignment, coarse_fit) = self.align(&view, frame, budget);
         std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
-        let estimate = self.held(reference, &view, frame, &alignment, &next, distance_variance);
+        let estimate =
+            self.estimate_on_view(reference, &view, frame, &alignment, &next, distance_variance);
         self.turning.view = Some(view);
         let estimate = estimate.filter(|(estimate, _)| {
-            let is_seen = self.sees(reference, estimate);
+            let is_seen = self.would_see(reference, estimate);
             next.in_view_secs = if is_seen { place.in_view_secs + step } else { 0.0 };
-            next.in_view_secs <= MOST_IN_VIEW_SECS
+            next.in_view_secs <= MAX_IN_VIEW_SECS
         });
         let is_cut_short = alignment.ending == Ending::OutOfBudget;
         let Some((estimate, covariance)) = estimate else {
             self.memory = lost;
-            if is_cut_short && (0.0..MOST_SECONDS).contains(&since_view) {
+            if is_cut_short && (0.0..MAX_SECONDS).contains(&since_view) {
                 // This frame tells nothing: the view waits for the next one, of which the same motion is expected.
                 self.memory.motion = before.motion.clone();
             } else {
@@ -267,13 +268,13 @@ impl Tracker {
         // A frame that was cut short does not become the view: its error would persist.
         if !is_cut_short {
             self.turning.coarse_fit = coarse_fit;
-            self.turning.take_over(&estimate, Place { covariance, ..next });
+            self.turning.set_view(&estimate, ViewPose { covariance, ..next });
         }
         Some(estimate)
     }
 
     /// Restores the memory before the loss, as needed for the frame on the view; returns that after the loss.
-    fn recall(&mut self, before: &Memory) -> Memory {
+    fn restore_memory(&mut self, before: &Memory) -> Memory {
         let held = Memory {
             last_sequence: self.memory.last_sequence,
             brightness: Brightness::default(),
@@ -287,7 +288,7 @@ impl Tracker {
 
     /// Whether a keyframe's points would be in view from the held pose: then the camera has not rotated away from them,
     /// and something else hides them.
-    fn sees(&self, reference: &Reference, held: &PoseEstimate) -> bool {
+    fn would_see(&self, reference: &Reference, held: &PoseEstimate) -> bool {
         let (aligner, pyramid) = (&self.aligner, &self.pyramid);
         let at = held.keyframe_from_camera.inverse();
         let seen = quality_of(&aligner.start(reference, pyramid, &at, Brightness::default()));
@@ -307,7 +308,7 @@ impl Tracker {
         let intervals = nanos.saturating_sub(place.nanos) as f64 * 1e-9 / INTERVAL;
         let uncertain = rotation_std_dev(&place.covariance);
         predicted.rotation.angle_to(&world_from_camera.rotation)
-            > MOST_CHANGE_RAD * intervals.max(1.0) + MOST_DEVIATIONS * uncertain
+            > MAX_CHANGE_RAD * intervals.max(1.0) + MAX_POSE_DEVIATIONS * uncertain
     }
 
     /// Ends the hold of a view.
@@ -341,7 +342,7 @@ impl Tracker {
         let speed = before.motion.speed().map_or(SPEED, |speed| SPEED.max(speed / unit));
         let world_from_view = Sim3::new(world_from_camera, unit);
         (turning.is_first, turning.coarse_fit) = (true, None);
-        turning.place = Some(Place {
+        turning.place = Some(ViewPose {
             world_from_view,
             since_secs: 0.0,
             in_view_secs: 0.0,
@@ -353,18 +354,18 @@ impl Tracker {
 
     /// The estimate of a frame aligned to the view, and the covariance in units of the mean depth; `None` where it does
     /// not fit as well as after a loss, or its translation is too uncertain.
-    fn held(
+    fn estimate_on_view(
         &self,
         reference: &Reference,
         view: &Reference,
         frame: &FrameView<'_>,
         alignment: &Alignment,
-        place: &Place,
+        place: &ViewPose,
         distance_variance: f64,
     ) -> Option<(PoseEstimate, Matrix6<f64>)> {
         let quality = self.quality_on_view(view, alignment);
         let predicted = self.memory.motion.predict(frame.capture_nanos, 1.0)?;
-        let expected = place.world_from_view.locate(&predicted).inverse();
+        let expected = place.world_from_view.inverse_transform_pose(&predicted).inverse();
         if !self.fits_view(view, alignment, &quality, &expected) {
             return None;
         }
@@ -381,16 +382,17 @@ impl Tracker {
         if !(deviation <= self.params.max_turning_deviation) {
             return None;
         }
-        let world_from_camera = place.world_from_view.place(&current_from_view.inverse());
-        let keyframe_from_camera = reference.world_from_keyframe().locate(&world_from_camera);
-        let map_from_camera = reference.map_from_keyframe().place(&keyframe_from_camera);
+        let world_from_camera = place.world_from_view.transform_pose(&current_from_view.inverse());
+        let keyframe_from_camera =
+            reference.world_from_keyframe().inverse_transform_pose(&world_from_camera);
+        let map_from_camera = reference.map_from_keyframe().transform_pose(&keyframe_from_camera);
         if !(world_from_camera.is_finite() && map_from_camera.is_finite()) {
             return None;
         }
         let unit = reference.world_from_keyframe().scale;
         let mut published = covariance;
         scale_translation(&mut published, place.world_from_view.scale / unit);
-        let in_map = reference.uncertain_place().of_camera(&keyframe_from_camera, &published);
+        let in_map = reference.uncertain_pose().of_camera(&keyframe_from_camera, &published);
         let state = TrackingState::Degraded(DegradedReason::Turning);
         let published = upper_triangle(|row, column| published[(row, column)]);
         let estimate = PoseEstimate {
@@ -425,19 +427,19 @@ impl Tracker {
         expected: &SE3,
     ) -> bool {
         let fits = self.params.verdict.judge(alignment, quality, false, 0);
-        let is_seen = quality.points >= FEWEST_POINTS
+        let is_seen = quality.points >= MIN_POINTS
             && matches!(
                 fits,
                 TrackingState::Tracking
                     | TrackingState::Degraded(DegradedReason::LowOverlap | DegradedReason::Budget)
             );
         // By image noise alone: parallax that the uncertain depth would explain is not a rotation.
-        let explained = self.aligner.explanation(view, &self.pyramid, alignment);
+        let explained = self.aligner.sums_with_exact_depth(view, &self.pyramid, alignment);
         let inliers = f64::from(explained.inliers) / f64::from(explained.compared.max(1));
-        let is_even = alignment.state.brightness.a.abs() <= MOST_GAIN;
+        let is_even = alignment.state.brightness.a.abs() <= MAX_LOG_GAIN;
         let change = expected.rotation.angle_to(&alignment.state.current_from_keyframe.rotation);
-        let is_smooth = self.turning.is_first || change <= MOST_CHANGE_RAD;
-        is_smooth && is_seen && inliers >= LEAST_INLIERS && is_even
+        let is_smooth = self.turning.is_first || change <= MAX_CHANGE_RAD;
+        is_smooth && is_seen && inliers >= MIN_INLIERS && is_even
     }
 
     /// Covariance of the step from the view, units of the mean depth: of the rotation as measured, of the translation
@@ -457,7 +459,7 @@ impl Tracker {
         of_step.fixed_view_mut::<6, 3>(0, 0).fill(0.0);
         (0..3).for_each(|axis| of_step[(axis, axis)] = distance_variance);
         // This comparison also rejects NaN.
-        (rotation_std_dev(&of_step) <= MOST_ROTATION_STD_DEV).then_some(of_step)
+        (rotation_std_dev(&of_step) <= MAX_ROTATION_STD_DEV).then_some(of_step)
     }
 }
 

@@ -132,10 +132,10 @@ pub fn quality_of(alignment: &Alignment) -> Quality {
     }
 }
 
-/// Whether one coarse alignment explains the frame better than another, both from [`Aligner::explanation`]: more
-/// inliers, counted over all points so that looking away does not pay.
+/// Whether one coarse alignment explains the frame better than another, both from [`Aligner::sums_with_exact_depth`]:
+/// more inliers, counted over all points so that looking away does not pay.
 ///
-/// [`Aligner::explanation`]: crate::slam::alignment::align::Aligner::explanation
+/// [`Aligner::sums_with_exact_depth`]: crate::slam::alignment::align::Aligner::sums_with_exact_depth
 pub fn is_better(one: &NormalEquations, other: &NormalEquations) -> bool {
     one.inliers > other.inliers
         || (one.inliers == other.inliers && one.mean_energy() < other.mean_energy())

@@ -89,7 +89,7 @@ impl Elimination {
         const MAX_DEPTH_STEP: f32 = 0.5;
         let step: [f32; NUM_UNKNOWNS] = std::array::from_fn(|k| step[k] as f32);
         after.clear();
-        let mut promised = LaneSum::default();
+        let mut predicted = LaneSum::default();
         let num_unknowns = system.num_unknowns();
         for (i, block) in system.blocks.iter().enumerate() {
             let d = lanes_of(inverse_depths, i, 1.0);
@@ -105,13 +105,13 @@ impl Elimination {
                     .clamp(INVERSE_DEPTHS.0, INVERSE_DEPTHS.1)
             });
             after.extend_from_slice(&changed);
-            promised.add(&lanes(|l| {
+            predicted.add(&lanes(|l| {
                 let gradient = self.slopes[i][l] / self.inverse_information[i][l];
                 -gradient * (changed[l] - d[l])
             }));
         }
         after.truncate(inverse_depths.len());
-        promised.total()
+        predicted.total()
     }
 }
 

@@ -152,7 +152,7 @@ pub fn fit_level(
             continue;
         };
         let least_drop = params.min_energy_drop * before;
-        if step.promised_drop < least_drop {
+        if step.predicted_decrease < least_drop {
             break;
         }
         let depths = std::mem::take(&mut scratch.trial_depths);
@@ -198,8 +198,8 @@ impl Damping {
     /// lowered it, by less than half a per cent.
     fn succeed(&mut self) {
         const SUCCESS_FACTOR: f64 = 0.3;
-        const LEAST_DAMPING: f64 = 1e-6;
-        self.factor = (self.factor * SUCCESS_FACTOR).max(LEAST_DAMPING);
+        const MIN_DAMPING: f64 = 1e-6;
+        self.factor = (self.factor * SUCCESS_FACTOR).max(MIN_DAMPING);
         self.patience = 1;
     }
 
@@ -216,7 +216,7 @@ impl Damping {
 struct Step {
     of_pose: SVector<f64, NUM_UNKNOWNS>,
     /// Predicted decrease of the energy if it were quadratic and the step undamped: −gᵀδ.
-    promised_drop: f64,
+    predicted_decrease: f64,
 }
 
 /// Energy of `system`, evaluated at `state`, with the priors.
@@ -242,7 +242,7 @@ fn step_of(
         hessian[(i, i)] = hessian[(i, i)] * (1.0 + damping) + f64::MIN_POSITIVE;
     }
     let of_pose = solve_free(freedom, system.has_slopes, &hessian, &system.gradient)?;
-    Some(Step { of_pose, promised_drop: -system.gradient.dot(&of_pose) })
+    Some(Step { of_pose, predicted_decrease: -system.gradient.dot(&of_pose) })
 }
 
 /// The state after a step of pose and brightness, without depths.
@@ -319,7 +319,7 @@ fn joint_step(scratch: &mut FitScratch, state: &State, damping: f64) -> Option<S
     let of_pose = solve_free(Freedom::Everything, system.has_slopes, &hessian, &gradient)?;
     let after = &mut scratch.trial_depths;
     let by_depths = elimination.depths_after(system, &state.inverse_depths, &of_pose, after);
-    Some(Step { of_pose, promised_drop: by_depths - system.gradient.dot(&of_pose) })
+    Some(Step { of_pose, predicted_decrease: by_depths - system.gradient.dot(&of_pose) })
 }
 
 /// Whether a step can be taken: finite and within what two consecutive frames show.
@@ -333,23 +333,23 @@ fn is_sane(step: &SVector<f64, NUM_UNKNOWNS>) -> bool {
 /// Share by which the energy of a fit that ended at `state` would decrease if the gain could vary over the image, to
 /// first order: the predicted decrease with free slopes minus the one still predicted without. The scratch is left as
 /// the fit left it on this level.
-pub fn promised_by_slopes(
+pub fn predicted_decrease_by_slopes(
     input: &FitInput<'_>,
     level: usize,
     state: &State,
     scratch: &mut FitScratch,
     params: &FitParams,
 ) -> f64 {
-    let promised = |scratch: &mut FitScratch, state: &State| {
+    let predicted = |scratch: &mut FitScratch, state: &State| {
         let step = step_of(Freedom::Everything, scratch, state, 0.0, params.prior_weights());
-        step.map_or(0.0, |step| step.promised_drop)
+        step.map_or(0.0, |step| step.predicted_decrease)
     };
-    let held = promised(scratch, state);
+    let held = predicted(scratch, state);
     let mut freed = state.clone();
     freed.free_slopes();
     scratch.trial.evaluate(&input.level(level), &freed);
     std::mem::swap(&mut scratch.system, &mut scratch.trial);
-    let free = promised(scratch, &freed);
+    let free = predicted(scratch, &freed);
     std::mem::swap(&mut scratch.system, &mut scratch.trial);
     (free - held) / scratch.system.energy.max(f64::MIN_POSITIVE)
 }
@@ -390,7 +390,7 @@ mod tests {
         let medians = vec![1.1; LANES];
         let mut scratch = FitScratch { system, medians, ..FitScratch::default() };
         scratch.elimination.weights = weights;
-        let Step { of_pose, promised_drop } = joint_step(&mut scratch, &state, 0.0).unwrap();
+        let Step { of_pose, predicted_decrease } = joint_step(&mut scratch, &state, 0.0).unwrap();
 
         let (system, before) = (&scratch.system, &state.inverse_depths);
         let quadratic = (of_pose.transpose() * system.hessian * of_pose)[0];
@@ -404,6 +404,9 @@ mod tests {
         let prior = |depths: &[f32]| prior_energy(depths, &scratch.medians, weights);
         change += prior(&scratch.trial_depths) - prior(before);
         assert!(change < -0.05, "{change}");
-        assert!((promised_drop + change).abs() < 1e-4 * promised_drop, "{promised_drop} {change}");
+        assert!(
+            (predicted_decrease + change).abs() < 1e-4 * predicted_decrease,
+            "{predicted_decrease} {change}"
+        );
     }
 }

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::two_frame::earlier_frames::EarlierFrames;
 use crate::slam::two_frame::fit::{
-    FitInput, FitParams, FitScratch, Freedom, fit_level, promised_by_slopes,
+    FitInput, FitParams, FitScratch, Freedom, fit_level, predicted_decrease_by_slopes,
 };
 use crate::slam::two_frame::state::State;
 use crate::slam::two_frame::system::compare;
@@ -125,9 +125,9 @@ impl Hypotheses {
         let of_earlier_frames = earlier_frames.compare(input, depths, params);
         let [mut best, mut other] = [0, 1].map(|i| of_this_frame[i] + of_earlier_frames[i]);
         /// A motion that sees less than this share of the other's points has lost them, however well the rest fits.
-        const LEAST_SEEN: f64 = 1.0 / 3.0;
+        const MIN_SEEN: f64 = 1.0 / 3.0;
         let seen = [0, 1].map(|i| self.all[i].scratch.system.num_visible as f64);
-        let [is_blind, other_is_blind] = [0, 1].map(|i| seen[i] < LEAST_SEEN * seen[1 - i]);
+        let [is_blind, other_is_blind] = [0, 1].map(|i| seen[i] < MIN_SEEN * seen[1 - i]);
         if is_blind || other < best && !other_is_blind {
             self.all.swap(0, 1);
             std::mem::swap(&mut best, &mut other);
@@ -147,9 +147,13 @@ impl Hypotheses {
     }
 
     /// Share by which the energy of the best fit would decrease if the gain could vary over the image.
-    pub fn promised_by_slopes(&mut self, input: &FitInput<'_>, params: &FitParams) -> f64 {
+    pub fn predicted_decrease_by_slopes(
+        &mut self,
+        input: &FitInput<'_>,
+        params: &FitParams,
+    ) -> f64 {
         let best = &mut self.all[0];
-        promised_by_slopes(input, 0, &best.state, &mut best.scratch, params)
+        predicted_decrease_by_slopes(input, 0, &best.state, &mut best.scratch, params)
     }
 
     /// Lets the gain vary over the image, from the next fit on.

@@ -9,7 +9,7 @@ use crate::slam::window::keyframe::Agreed;
 /// Least share of inliers among the comparisons with a host's points at which some of them are taken as seen: of points
 /// behind a wall one in ten to three agrees by chance, more on a wall of little contrast; of visible ones four in five,
 /// and of a host seen through a door a share in between.
-const LEAST_SHARE: f64 = 0.3;
+const MIN_SHARE: f64 = 0.3;
 
 impl Window {
     /// Records, right after an adjustment, the points that members agree with whose own points are still to be chosen:
@@ -25,7 +25,7 @@ impl Window {
             agreed.clear();
             for pair in views.pairs.iter().filter(|pair| pair.observer == place) {
                 let inliers = system.inliers_among(pair.places(), most_energy);
-                if (inliers as f64) < LEAST_SHARE * pair.count as f64 {
+                if (inliers as f64) < MIN_SHARE * pair.count as f64 {
                     continue;
                 }
                 let keyframe_id = self.keyframes[members[pair.host]].keyframe_id;
@@ -71,7 +71,7 @@ mod tests {
             })
             .collect();
         depth.sort_by_key(|point| (point.v, point.u));
-        assert!(!window.projected_into(last, &depth).is_empty());
+        assert!(!window.projected_correspondences(last, &depth).is_empty());
         // Something else occludes all of it.
         let mut random = Random::new(5);
         let mut wall = vec![0u8; CAMERA.width * CAMERA.height];
@@ -81,6 +81,9 @@ mod tests {
         assert!(window.align_last(&members, &[0], 0));
         window.note_agreement(&members);
         assert_eq!(window.keyframes[last].agreed, []);
-        assert!(window.projected_into(last, &depth).is_empty(), "they say nothing of its depth");
+        assert!(
+            window.projected_correspondences(last, &depth).is_empty(),
+            "they say nothing of its depth"
+        );
     }
 }

@@ -8,7 +8,7 @@ use crate::slam::window::selection::choose_spread;
 
 /// Fewer mature points than this constrain neither a keyframe's pose nor a plane through its depth, which needs 30: the
 /// points are then chosen from its depth.
-const FEWEST_MATURE: usize = 40;
+const MIN_MATURE: usize = 40;
 
 /// Points of the interval filter that were mature when their keyframe was left.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,14 +39,14 @@ impl Candidates {
     ) -> Vec<DepthPoint> {
         let choose = |points: &[DepthPoint]| choose_spread(points, pixels, camera, params);
         let of_mature = self.mature.as_deref().map(choose);
-        let are_enough = |chosen: &Vec<DepthPoint>| chosen.len() >= FEWEST_MATURE;
+        let are_enough = |chosen: &Vec<DepthPoint>| chosen.len() >= MIN_MATURE;
         of_mature.filter(are_enough).unwrap_or_else(|| choose(&self.depth))
     }
 }
 
 impl Window {
-    /// Takes the mature points of keyframes that were left since the last call, for [`Window::take_in`]. A keyframe
-    /// without a list, or with too few points to choose from in it, has its points from its depth.
+    /// Takes the mature points of keyframes that were left since the last call, for [`Window::update_from_map`]. A
+    /// keyframe without a list, or with too few points to choose from in it, has its points from its depth.
     pub fn take_mature(&mut self, mature: &mut Vec<MaturePoints>) {
         self.mature.append(mature);
     }
@@ -94,7 +94,7 @@ mod tests {
         let mut window = Window::new(CAMERA, WindowParams::default());
         let mut given = vec![MaturePoints { keyframe_id, points: mature.to_vec() }];
         window.take_mature(&mut given);
-        assert!(given.is_empty() && window.take_in(map, 1));
+        assert!(given.is_empty() && window.update_from_map(map, 1));
         window.optimise();
         assert!(window.mature.is_empty() && window.keyframes[0].is_host);
         window.keyframes[0].points.iter().map(|point| (point.u, point.v)).collect()
@@ -111,7 +111,7 @@ mod tests {
         let of_depth = chosen(&map, &mature, 1);
         assert!(of_depth.len() > 300 && !of_depth.iter().all(is_mature));
         // None, and one too few.
-        for few in [&[][..], &mature[..FEWEST_MATURE - 1]] {
+        for few in [&[][..], &mature[..MIN_MATURE - 1]] {
             assert_eq!(chosen(&map, few, 0), of_depth, "{}", few.len());
         }
     }

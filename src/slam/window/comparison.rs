@@ -34,14 +34,14 @@ pub type Lane = [f32; LANES];
 
 /// Appearance of a point in its host, at one level.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Look {
+pub struct PatternAppearance {
     /// Samples over their mean.
     pub shape: [f32; SAMPLES],
     /// Weight by the gradient: sub-pixel errors show there. All 0 where the pattern leaves the image or is dark.
     pub weight: [f32; SAMPLES],
 }
 
-impl Look {
+impl PatternAppearance {
     /// Whether there is a valid pattern.
     pub fn is_whole(&self) -> bool {
         self.weight[0] > 0.0
@@ -80,13 +80,13 @@ impl Patterns {
 
     /// Puts a point into a lane; does nothing where it has no valid pattern.
     #[inline(always)]
-    pub fn set(&mut self, lane: usize, look: &Look, ray: [f32; 2]) {
-        if !look.is_whole() {
+    pub fn set(&mut self, lane: usize, appearance: &PatternAppearance, ray: [f32; 2]) {
+        if !appearance.is_whole() {
             return;
         }
         for k in 0..SAMPLES {
-            self.shape[k][lane] = look.shape[k];
-            self.weight[k][lane] = look.weight[k];
+            self.shape[k][lane] = appearance.shape[k];
+            self.weight[k][lane] = appearance.weight[k];
         }
         self.ray[0][lane] = ray[0];
         self.ray[1][lane] = ray[1];

@@ -3,7 +3,8 @@
 use nalgebra::Vector6;
 
 use super::comparison::{
-    Compared, LANES, Look, POSE, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted, sum,
+    Compared, LANES, POSE, Pair, PairSums, PatternAppearance, Patterns, Robustness, SAMPLES,
+    Wanted, sum,
 };
 use crate::slam::depth::pattern::{PATTERN, sum_of_samples};
 use crate::slam::geometry::se3::SE3;
@@ -27,13 +28,13 @@ fn waves(phase: f32) -> SharedImage {
 }
 
 /// Appearance of the pattern around a pixel, every sample of weight 1.
-fn look(image: &SharedImage, u: usize, v: usize) -> Look {
+fn appearance(image: &SharedImage, u: usize, v: usize) -> PatternAppearance {
     let samples = PATTERN.map(|(du, dv)| {
         let row = image.row(v.wrapping_add_signed(dv as isize));
         f32::from(row[u.wrapping_add_signed(du as isize)])
     });
     let mean = sum_of_samples(&samples) / SAMPLES as f32;
-    Look { shape: samples.map(|grey| grey / mean), weight: [1.0; SAMPLES] }
+    PatternAppearance { shape: samples.map(|grey| grey / mean), weight: [1.0; SAMPLES] }
 }
 
 /// The ray of a pixel, at depth 1.
@@ -48,13 +49,13 @@ fn compare(
     kernel: Kernel,
     image: &SharedImage,
     pair: &Pair,
-    look: &Look,
+    appearance: &PatternAppearance,
     ray: [f32; 2],
     depth: f32,
     robustness: &Robustness,
 ) -> (Compared, PairSums) {
     let (mut patterns, mut seen) = (Patterns::NONE, [Compared::NONE]);
-    patterns.set(0, look, ray);
+    patterns.set(0, appearance, ray);
     patterns.inverse_depth[0] = depth;
     let mut sums = PairSums::default();
     kernel.compare(image, pair, &[patterns], robustness, &mut seen, &mut sums);
@@ -64,13 +65,14 @@ fn compare(
 /// Cost of a comparison and half its gradient, with respect to the observer's pose and to depth.
 fn compared(
     image: &SharedImage,
-    look: &Look,
+    appearance: &PatternAppearance,
     ray: [f32; 2],
     pose: &SE3,
     depth: f64,
 ) -> (f64, [f64; POSE + 1]) {
     let pair = Pair::new(pose, &CAMERA, ALL_WANTED);
-    let (seen, sums) = compare(Kernel::Portable, image, &pair, look, ray, depth as f32, &EASY);
+    let (seen, sums) =
+        compare(Kernel::Portable, image, &pair, appearance, ray, depth as f32, &EASY);
     assert!(seen.cost[0].is_finite());
     let mut gradient = [0.0; POSE + 1];
     (0..POSE).for_each(|m| gradient[m] = f64::from(sum(&sums.right[m])));
@@ -83,9 +85,9 @@ fn derivatives_match_differences_of_the_cost() {
     let (host, observer) = (waves(0.0), waves(0.4));
     let pose = SE3::exp(&Vector6::from([0.1, -0.05, 0.08, 0.02, -0.03, 0.05]));
     for (u, v, depth) in [(80, 60, 0.4), (200, 150, 0.9), (150, 40, 0.2)] {
-        let look = look(&host, u, v);
+        let appearance = appearance(&host, u, v);
         let ray = ray(u as f64, v as f64);
-        let at = |pose: &SE3, depth: f64| compared(&observer, &look, ray, pose, depth);
+        let at = |pose: &SE3, depth: f64| compared(&observer, &appearance, ray, pose, depth);
         let found = at(&pose, depth).1;
         // A two-hundredth of a pixel to each side: hardly a sample leaves its four pixels, where the gradient is exact.
         let pixels = 0.005 / CAMERA.fx;
@@ -115,7 +117,7 @@ fn derivatives_match_differences_of_the_cost() {
 /// Returns the cost, the sums H of (pose, depth) and the right side.
 fn explained(
     image: &SharedImage,
-    look: &Look,
+    appearance: &PatternAppearance,
     ray: [f32; 2],
     pose: &SE3,
     depth: f64,
@@ -154,9 +156,9 @@ fn explained(
     let mut right = [0.0; POSE + 1];
     for (k, row) in rows.iter().enumerate() {
         let of: [f64; POSE + 2] =
-            std::array::from_fn(|m| row[m] - f64::from(look.shape[k]) * means[m]);
+            std::array::from_fn(|m| row[m] - f64::from(appearance.shape[k]) * means[m]);
         let huber = (f64::from(robustness.huber_grey) / of[0].abs()).min(1.0);
-        let weight = f64::from(look.weight[k]) * huber;
+        let weight = f64::from(appearance.weight[k]) * huber;
         cost += weight * (2.0 - huber) * of[0] * of[0];
         for a in 0..=POSE {
             (0..=POSE).for_each(|b| hessian[a][b] += weight * of[a + 1] * of[b + 1]);
@@ -172,12 +174,14 @@ fn sums_match_the_reference_comparison() {
     let robustness = Robustness { huber_grey: 9.0, most_energy: f32::INFINITY };
     let pose = SE3::exp(&Vector6::from([0.1, -0.05, 0.08, 0.02, -0.03, 0.05]));
     for (u, v, depth) in [(60, 50, 0.4), (250, 190, 0.9), (70, 190, 0.2), (240, 45, 0.6)] {
-        let look = look(&host, u, v);
+        let appearance = appearance(&host, u, v);
         let ray = ray(u as f64, v as f64);
         let pair = Pair::new(&pose, &CAMERA, ALL_WANTED);
         let kernel = Kernel::Portable;
-        let (seen, sums) = compare(kernel, &observer, &pair, &look, ray, depth as f32, &robustness);
-        let (cost, hessian, right) = explained(&observer, &look, ray, &pose, depth, &robustness);
+        let (seen, sums) =
+            compare(kernel, &observer, &pair, &appearance, ray, depth as f32, &robustness);
+        let (cost, hessian, right) =
+            explained(&observer, &appearance, ray, &pose, depth, &robustness);
         assert!((f64::from(seen.cost[0]) - cost).abs() < 1e-3 * cost, "{cost}");
         // Relative to what the diagonal allows.
         let near = |found: f32, expected: f64, a: usize, b: usize| {
@@ -224,8 +228,8 @@ fn all_instruction_sets_give_the_same_bits() {
         let mut patterns = [Patterns::NONE; 2];
         for k in 0..LANES + 5 {
             let (u, v, depth) = (next(4.0, 315.0), next(4.0, 235.0), next(0.0, 2.0) as f32);
-            let look = look(&image, u as usize, v as usize);
-            patterns[k / LANES].set(k % LANES, &look, ray(u, v));
+            let appearance = appearance(&image, u as usize, v as usize);
+            patterns[k / LANES].set(k % LANES, &appearance, ray(u, v));
             patterns[k / LANES].inverse_depth[k % LANES] = depth;
         }
         let run = |kernel: Kernel| {
@@ -254,7 +258,7 @@ fn all_instruction_sets_give_the_same_bits() {
 #[test]
 fn invalid_numbers_are_outside_the_image() {
     let image = waves(0.0);
-    let look = look(&image, 100, 100);
+    let appearance = appearance(&image, 100, 100);
     let pair = Pair::new(&SE3::identity(), &CAMERA, ALL_WANTED);
     let wild = [
         ([f32::NAN, 0.0], 1.0),
@@ -266,14 +270,14 @@ fn invalid_numbers_are_outside_the_image() {
     ];
     for kernel in Kernel::available() {
         for (ray, depth) in wild {
-            let (seen, sums) = compare(kernel, &image, &pair, &look, ray, depth, &EASY);
+            let (seen, sums) = compare(kernel, &image, &pair, &appearance, ray, depth, &EASY);
             let all = sums.pose.iter().chain(&sums.right).chain(&seen.observer).chain(&seen.host);
             assert!(all.flatten().all(|number| number.is_finite()), "{ray:?} {depth}");
             assert!(seen.cost[1].is_nan() && seen.depth[0].is_finite(), "{ray:?} {depth}");
         }
         // An image smaller than the camera's is not read.
         let small = SharedImage::try_from_pixels(100, 50, [7; 5000].into()).unwrap();
-        let (seen, _) = compare(kernel, &small, &pair, &look, ray(150.0, 100.0), 1.0, &EASY);
+        let (seen, _) = compare(kernel, &small, &pair, &appearance, ray(150.0, 100.0), 1.0, &EASY);
         assert!(seen.cost.iter().all(|cost| cost.is_nan()));
     }
 }

@@ -10,21 +10,21 @@ const PIECE: usize = 40;
 /// Keyframes from one piece to the next: each is free twice, among those before it and among those after it.
 const STEP: usize = 20;
 /// Newest keyframes that are estimated once more: six pieces take a few seconds.
-pub(super) const MOST: usize = 120;
+pub(super) const MAX_NEWEST: usize = 120;
 /// Most iterations of a level: further ones only lower the part of the cost that is due to interpolation.
 const MAX_ITERATIONS: u32 = 15;
 
 impl Window {
-    /// Estimates the newest keyframes of the epoch, at most `MOST`, piece by piece.
+    /// Estimates the newest keyframes of the epoch, at most `MAX_NEWEST`, piece by piece.
     pub(super) fn adjust_all(&mut self, newest: usize) -> Option<Adjustment> {
         let of_epoch = self.of_epoch_up_to(newest);
         let mut last = None;
-        let mut begin = of_epoch.len().saturating_sub(MOST);
+        let mut begin = of_epoch.len().saturating_sub(MAX_NEWEST);
         loop {
             let end = (begin + PIECE).min(of_epoch.len());
             let chosen = self.choose_piece(&of_epoch, begin, end);
             last = self.adjust_within(&chosen, MAX_ITERATIONS).or(last);
-            self.leave(&chosen.members);
+            self.free_unused_images(&chosen.members);
             if end == of_epoch.len() {
                 return last;
             }
@@ -38,7 +38,7 @@ impl Window {
         let (begin, end) = (of_epoch.len().saturating_sub(PIECE), of_epoch.len());
         let chosen = self.choose_piece(&of_epoch, begin, end);
         let adjustment = self.adjust(&chosen);
-        self.leave(&chosen.members);
+        self.free_unused_images(&chosen.members);
         adjustment
     }
 

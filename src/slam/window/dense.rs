@@ -19,7 +19,7 @@ use crate::slam::window::Window;
 use crate::slam::window::comparison::{
     Compared, LANES, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted,
 };
-use crate::slam::window::keyframe::{WindowKeyframe, at_level, look_at, num_levels};
+use crate::slam::window::keyframe::{WindowKeyframe, at_level, num_levels, sample_pattern};
 use crate::slam::window::neighbours::{Neighbourhood, Single};
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::plane::fit;
@@ -36,7 +36,7 @@ const MAX_STEP: f32 = 1.3;
 /// Samples of a pattern that err together: they overlap with their neighbours' interpolation.
 const SAMPLES_TOGETHER: f64 = 2.0;
 /// Depths that differ by more standard deviations than this belong to different surfaces: the filter's is kept.
-const MOST_APART: f64 = 3.0;
+const MAX_DEVIATIONS: f64 = 3.0;
 /// Factor by which its variance then grows: it is half as certain.
 const CONTRADICTED: f64 = 4.0;
 /// Factor on the variance of a point on which filter and keyframes agree, for each squared standard deviation that they
@@ -99,7 +99,7 @@ impl Window {
     }
 
     /// The estimate was dropped: depth is not refined from it.
-    pub fn leave_unrefined(&mut self) {
+    pub fn discard_refinement(&mut self) {
         let Refinement { waiting, done, begun, refined } = &mut self.refinement;
         waiting.clear();
         let begun = begun.take().map(|of| of.keyframe_id);
@@ -132,14 +132,14 @@ impl Window {
     }
 
     /// The keyframe's depth has changed since its refinement began: it is refined another time.
-    pub fn refine_later(&mut self, keyframe_id: u64) {
+    pub fn requeue_refinement(&mut self, keyframe_id: u64) {
         self.refinement.done.remove(&keyframe_id);
     }
 
     /// Refines the keyframe that was taken for this; false where none was.
-    pub(super) fn refine_begun(&mut self) -> bool {
+    pub(super) fn run_refinement(&mut self) -> bool {
         let Some(keyframe) = self.refinement.begun.take() else { return false };
-        self.refinement.refined = self.refined(&keyframe);
+        self.refinement.refined = self.refine_keyframe(&keyframe);
         true
     }
 
@@ -149,7 +149,7 @@ impl Window {
     }
 
     /// Refines the depth of a keyframe of the map from those that see most of it; `None` where none does.
-    pub fn refined(&self, keyframe: &Keyframe) -> Option<RefinedDepth> {
+    pub fn refine_keyframe(&self, keyframe: &Keyframe) -> Option<RefinedDepth> {
         let index = self.index_of(keyframe.keyframe_id)?;
         let host = &self.keyframes[index];
         let is_other = |&k: &usize| k != index && self.keyframes[k].epoch == host.epoch;
@@ -222,7 +222,8 @@ impl Window {
 
     /// The keyframe's points, inverse depth in 1 / unit of the map, corrected by the plane that fits its chosen points.
     fn placed_points(&self, host: &WindowKeyframe, keyframe: &Keyframe) -> Vec<DepthPoint> {
-        let [offset, per_x, per_y] = fit(&self.of_own_points(host, keyframe)).unwrap_or_default();
+        let [offset, per_x, per_y] =
+            fit(&self.own_correspondences(host, keyframe)).unwrap_or_default();
         let plane = LogPlane { offset, per_x, per_y };
         let unit = keyframe.map_from_keyframe.scale;
         let place = |point: &DepthPoint| {
@@ -250,8 +251,9 @@ impl Window {
             let (level, camera) = (observers.level, &self.camera);
             let half_weight_gradient = self.params.half_weight_gradient;
             let (image, patterns) = (&images[level], &mut chunk.patterns);
-            let look = Looking { points, image, level, camera, half_weight_gradient, patterns };
-            Kernel::fastest().run(look);
+            let appearance =
+                PatternSampler { points, image, level, camera, half_weight_gradient, patterns };
+            Kernel::fastest().run(appearance);
             chunk.descend(&mut states, observers);
         }
         states
@@ -271,7 +273,7 @@ fn by_chunk<T: Send>(points: usize, of: impl Fn(Range<usize>) -> Vec<T> + Sync) 
 }
 
 /// Determines the appearance of a host's points at a level.
-struct Looking<'a> {
+struct PatternSampler<'a> {
     points: &'a [DepthPoint],
     image: &'a SharedImage,
     level: usize,
@@ -280,7 +282,7 @@ struct Looking<'a> {
     patterns: &'a mut [Patterns],
 }
 
-impl Body for Looking<'_> {
+impl Body for PatternSampler<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -288,10 +290,10 @@ impl Body for Looking<'_> {
         self.patterns.fill(Patterns::NONE);
         for (place, point) in self.points.iter().enumerate() {
             let [u, v] = [point.u, point.v].map(|pixel| at_level(pixel, self.level));
-            let look = look_at(self.image, u, v, self.half_weight_gradient);
+            let appearance = sample_pattern(self.image, u, v, self.half_weight_gradient);
             let ray = self.camera.ray(f64::from(point.u), f64::from(point.v));
             let ray = [ray.x as f32, ray.y as f32];
-            self.patterns[place / LANES].set(place % LANES, &look, ray);
+            self.patterns[place / LANES].set(place % LANES, &appearance, ray);
         }
     }
 }
@@ -397,7 +399,7 @@ fn fused(filter: &DepthPoint, found: &State, mean_squared_residual: f64) -> Sing
     let of_keyframes = SAMPLES_TOGETHER * mean_squared_residual / f64::from(found.hessian);
     let is = f64::from(found.inverse_depth);
     let apart = (is - was).powi(2) / (of_keyframes + of_filter);
-    if !(apart <= MOST_APART * MOST_APART) {
+    if !(apart <= MAX_DEVIATIONS * MAX_DEVIATIONS) {
         return unchanged(CONTRADICTED);
     }
     let share = of_filter / (of_filter + of_keyframes);

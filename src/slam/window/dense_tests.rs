@@ -55,7 +55,7 @@ fn refinement_removes_noise_and_relief_and_increases_certainty() {
     let room = room(|_, _| (1.0, 0.0));
     let (keyframe, truth) = keyframe(&room, 0.1);
     let before = median_size(&errors(&keyframe.points, &truth));
-    let refined = window(&room).refined(&keyframe).unwrap();
+    let refined = window(&room).refine_keyframe(&keyframe).unwrap();
     assert_eq!((refined.keyframe_id, refined.points.len()), (1, keyframe.points.len()));
     let left = errors(&refined.points, &truth);
     let after = median_size(&left);
@@ -87,7 +87,7 @@ fn depth_that_contradicts_the_keyframes_is_left_unchanged() {
     let sure = keyframe.points.len() / 2;
     keyframe.points[sure].inverse_depth *= 1.2;
     keyframe.points[sure].variance = 1e-8;
-    let refined = window(&room).refined(&keyframe).unwrap();
+    let refined = window(&room).refine_keyframe(&keyframe).unwrap();
     let plane_only = refined.points[sure].inverse_depth / keyframe.points[sure].inverse_depth;
     assert!((plane_only - 1.0).abs() < 0.02, "{plane_only}");
 }
@@ -99,9 +99,9 @@ fn a_keyframe_that_no_other_sees_is_not_refined() {
     for (index, other) in room.keyframes.iter_mut().enumerate() {
         other.epoch = u32::from(index == 1);
     }
-    assert_eq!(window(&room).refined(&keyframe), None);
+    assert_eq!(window(&room).refine_keyframe(&keyframe), None);
     let unknown = Keyframe { keyframe_id: 9, ..keyframe };
-    assert_eq!(window(&room).refined(&unknown), None);
+    assert_eq!(window(&room).refine_keyframe(&unknown), None);
 }
 
 #[test]
@@ -110,7 +110,7 @@ fn refined_depth_does_not_depend_on_the_number_of_threads() {
     let (keyframe, _) = keyframe(&room, 0.1);
     let with = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| window(&room).refined(&keyframe))
+        pool.install(|| window(&room).refine_keyframe(&keyframe))
     };
     assert_eq!(with(1), with(3));
 }
@@ -123,7 +123,7 @@ fn every_keyframe_is_refined_once_and_none_after_a_dropped_estimate() {
         std::iter::from_fn(|| window.next_unrefined()).collect()
     };
     window.refinement.begin(&window.keyframes);
-    window.leave_unrefined();
+    window.discard_refinement();
     assert_eq!(window.next_unrefined(), None);
     assert_eq!(taken(&mut window), [3, 2, 1, 0]);
     assert!(taken(&mut window).is_empty());

@@ -2,26 +2,30 @@
 
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
+use crate::slam::keyframe_pose_covariance::{KeyframePoseCovariance, UncertainPose};
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane, Map};
 use crate::slam::modes::ModeCovariance;
-use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
 use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::marginals::Marginal;
 use crate::slam::window::plane::{Correspondence, fit, relief_left};
-use crate::slam::window::view::Sight;
+use crate::slam::window::view::ObserverView;
 use crate::slam::window::{Window, selection};
 
 /// Covariances derived from a marginal: of the modes of a keyframe's depth, and of its place.
-pub type Said = (ModeCovariance, Option<PlaceCovariance>);
+pub type MarginalCovariances = (ModeCovariance, Option<KeyframePoseCovariance>);
 
 impl Window {
     /// The correction of the map by the last adjustment: the keyframes that were free move, and their depth is moved to
-    /// where their points are. `said_of` derives a keyframe's covariances from its marginal.
-    pub fn correction(&self, map: &Map, said_of: impl Fn(&Marginal) -> Said) -> Correction {
+    /// where their points are. `covariances_of` derives a keyframe's covariances from its marginal.
+    pub fn correction(
+        &self,
+        map: &Map,
+        covariances_of: impl Fn(&Marginal) -> MarginalCovariances,
+    ) -> Correction {
         let mut keyframes: Vec<KeyframeCorrection> = Vec::new();
         for &id in &self.moved {
             let Some(keyframe) = map.get(id) else { continue };
-            keyframes.extend(self.corrected(keyframe, &said_of));
+            keyframes.extend(self.keyframe_correction(keyframe, &covariances_of));
         }
         let followers = self.followers(map, &keyframes);
         keyframes.extend(followers);
@@ -43,37 +47,37 @@ impl Window {
                 * was.map_from_keyframe.inverse()
                 * keyframe.map_from_keyframe;
             let place = leader.place.map(|covariance| {
-                let is = UncertainPlace { map_from_keyframe: leader.map_from_keyframe, covariance };
-                keyframe.uncertain_place().following(&was.uncertain_place(), &is)
+                let is = UncertainPose { map_from_keyframe: leader.map_from_keyframe, covariance };
+                keyframe.uncertain_pose().following(&was.uncertain_pose(), &is)
             });
             Some(KeyframeCorrection {
                 place,
-                ..KeyframeCorrection::of_place(keyframe.keyframe_id, map_from_keyframe)
+                ..KeyframeCorrection::of_pose(keyframe.keyframe_id, map_from_keyframe)
             })
         };
         map.keyframes.iter().filter(follows).filter_map(follow).collect()
     }
 
-    fn corrected(
+    fn keyframe_correction(
         &self,
         keyframe: &Keyframe,
-        said_of: impl Fn(&Marginal) -> Said,
+        covariances_of: impl Fn(&Marginal) -> MarginalCovariances,
     ) -> Option<KeyframeCorrection> {
         let known = self.get(keyframe.keyframe_id)?;
         let place = known.camera_from_map.inverse();
         let unit = keyframe.map_from_keyframe.scale;
         let better = match known.is_host {
-            true => self.of_own_points(known, keyframe),
+            true => self.own_correspondences(known, keyframe),
             false => {
                 let index = self.index_of(keyframe.keyframe_id)?;
-                self.projected_into(index, &keyframe.points)
+                self.projected_correspondences(index, &keyframe.points)
             }
         };
         // Depth in the unit of the map is larger by e^offset, so that the unit is shorter.
         let plane = fit(&better);
         // Depth that was not moved to the points is no more certain than before.
         let is_tilted = plane.is_some_and(|[_, per_x, per_y]| (per_x, per_y) != (0.0, 0.0));
-        let said = self.marginal_of(keyframe.keyframe_id).map(said_of);
+        let said = self.marginal_of(keyframe.keyframe_id).map(covariances_of);
         // The plane leaves the depth's own relief, while the estimate's covariance is that of the points' relief.
         let relief = plane.map_or(0.0, |plane| relief_left(&better, &plane));
         let modes = said.map(|(modes, _)| modes.with_relief_error(relief)).filter(|_| is_tilted);
@@ -89,7 +93,7 @@ impl Window {
     }
 
     /// Correspondences of a keyframe's own points with its depth.
-    pub(super) fn of_own_points(
+    pub(super) fn own_correspondences(
         &self,
         host: &WindowKeyframe,
         keyframe: &Keyframe,
@@ -111,7 +115,7 @@ impl Window {
     }
 
     /// Correspondences of a keyframe's depth with the points of other keyframes that it agrees with.
-    pub(super) fn projected_into(
+    pub(super) fn projected_correspondences(
         &self,
         index: usize,
         points: &[DepthPoint],
@@ -124,8 +128,10 @@ impl Window {
             else {
                 continue;
             };
-            let sight =
-                Sight::new(&(to.camera_from_map * host.camera_from_map.inverse()), &self.camera);
+            let sight = ObserverView::new(
+                &(to.camera_from_map * host.camera_from_map.inverse()),
+                &self.camera,
+            );
             let points = of_host.iter().filter_map(|of| host.points.get(of.point));
             for point in points.filter(|point| point.is_alive) {
                 let Some(seen) = sight.project(point) else { continue };

@@ -6,12 +6,12 @@
 use std::sync::Arc;
 
 use crate::slam::geometry::se3::SE3;
-use crate::slam::map::PlacedFrame;
+use crate::slam::map::RealignedFrame;
 use crate::slam::window::{ALIGNMENT_LEVELS, Window};
 
 /// Frames aligned with one adjustment: twice as many as lie between two keyframes, so that the backlog of an epoch's
 /// first keyframes is cleared without delaying it.
-const MOST_AT_ONCE: usize = 30;
+const MAX_FRAMES_AT_ONCE: usize = 30;
 /// Up to this many are aligned in the time of one or two frames.
 const FEW_FRAMES: usize = 8;
 /// Keyframes after its own that a frame of an epoch's first keyframes waits for: all of these move with each estimate,
@@ -27,9 +27,9 @@ const MAX_ITERATIONS: u32 = 10;
 /// Keyframes before and after its own whose points a frame is aligned to.
 const REACH: usize = 3;
 /// Comparisons that must agree with a frame's new pose.
-const FEWEST_INLIERS: usize = 60;
+const MIN_INLIERS: usize = 60;
 /// Share of the comparisons that must agree.
-const LEAST_INLIER_RATIO: f64 = 0.5;
+const MIN_INLIER_RATIO: f64 = 0.5;
 
 /// A tracked frame to be aligned again, or a frame from before its map started.
 #[derive(Debug, Clone, PartialEq)]
@@ -50,7 +50,7 @@ pub struct TrackedFrame {
 #[derive(Debug, Clone, Default)]
 pub(super) struct WindowFrames {
     waiting: Vec<TrackedFrame>,
-    placed: Vec<PlacedFrame>,
+    placed: Vec<RealignedFrame>,
     /// Set where frames that have waited long enough are to be aligned: whether after an epoch's first keyframes.
     planned: Option<bool>,
     /// Whether the window was taken out for that.
@@ -69,7 +69,7 @@ impl Window {
     }
 
     /// Takes the frames that were aligned again since the last call.
-    pub fn take_placed(&mut self) -> Vec<PlacedFrame> {
+    pub fn take_realigned(&mut self) -> Vec<RealignedFrame> {
         std::mem::take(&mut self.frames.placed)
     }
 
@@ -77,12 +77,12 @@ impl Window {
     /// many, so that the keyframes need not wait. Aligns them at once where they are few, since keyframes in such close
     /// succession should not wait for a task, and where those of the estimate before are still pending.
     pub(super) fn plan_frames(&mut self, newest: usize, is_first: bool) {
-        let end = self.settled(newest, is_first);
+        let end = self.num_followed(newest, is_first);
         let is_ready = |frame: &&TrackedFrame| self.index_of(frame.keyframe_id) < Some(end);
         let are_many = self.frames.waiting.iter().filter(is_ready).count() > FEW_FRAMES;
         match self.frames.planned.take() {
             None if are_many => self.frames.planned = Some(is_first),
-            _ => self.place_frames(newest, is_first),
+            _ => self.realign_frames(newest, is_first),
         }
     }
 
@@ -93,45 +93,45 @@ impl Window {
     }
 
     /// Aligns the frames if the window was taken out for them; false otherwise.
-    pub(super) fn frames_begun(&mut self) -> bool {
+    pub(super) fn realign_planned_frames(&mut self) -> bool {
         if !std::mem::take(&mut self.frames.is_begun) {
             return false;
         }
         if let (Some(newest), Some(is_first)) =
             (self.keyframes.len().checked_sub(1), self.frames.planned.take())
         {
-            self.place_frames(newest, is_first);
+            self.realign_frames(newest, is_first);
             let members = self.choose_members(newest).members;
-            self.leave(&members);
+            self.free_unused_images(&members);
         }
         self.frames.is_done = true;
         true
     }
 
     /// Takes the frames that were aligned, if the window was taken out for them alone.
-    pub fn take_frames_alone(&mut self) -> Option<Vec<PlacedFrame>> {
-        std::mem::take(&mut self.frames.is_done).then(|| self.take_placed())
+    pub fn take_planned_frames(&mut self) -> Option<Vec<RealignedFrame>> {
+        std::mem::take(&mut self.frames.is_done).then(|| self.take_realigned())
     }
 
     /// Aligns the frames whose keyframes enough others have followed, more among an epoch's first ones.
-    fn place_frames(&mut self, newest: usize, is_first: bool) {
-        self.place_frames_before(self.settled(newest, is_first), MOST_AT_ONCE);
+    fn realign_frames(&mut self, newest: usize, is_first: bool) {
+        self.realign_frames_before(self.num_followed(newest, is_first), MAX_FRAMES_AT_ONCE);
     }
 
     /// Number of keyframes that enough others have followed.
-    fn settled(&self, newest: usize, is_first: bool) -> usize {
+    fn num_followed(&self, newest: usize, is_first: bool) -> usize {
         let lag =
             if is_first { self.params.frame_lag.max(FIRST_LAG) } else { self.params.frame_lag };
         (newest + 1).saturating_sub(lag)
     }
 
     /// Aligns all frames that still wait.
-    pub fn place_rest(&mut self) {
+    pub fn realign_rest(&mut self) {
         self.frames.planned = None;
-        self.place_frames_before(self.keyframes.len(), usize::MAX);
+        self.realign_frames_before(self.keyframes.len(), usize::MAX);
     }
 
-    fn place_frames_before(&mut self, end: usize, most: usize) {
+    fn realign_frames_before(&mut self, end: usize, most: usize) {
         let mut waiting = std::mem::take(&mut self.frames.waiting);
         let mut left = most;
         self.retrace(&mut waiting, end, &mut left);
@@ -141,7 +141,7 @@ impl Window {
                 return true;
             }
             left -= 1;
-            let placed = index.and_then(|index| self.place_frame(index, frame));
+            let placed = index.and_then(|index| self.realign_frame(index, frame));
             self.frames.placed.extend(placed);
             false
         });
@@ -165,7 +165,7 @@ impl Window {
                 frame.keyframe_from_camera = off * guess;
             }
             let index = self.index_of(keyframe_id);
-            let placed = index.and_then(|index| self.place_frame(index, &frame));
+            let placed = index.and_then(|index| self.realign_frame(index, &frame));
             let (Some(placed), Some(index)) = (placed, index) else {
                 waiting.retain(|other| !(other.is_guess && other.keyframe_id == keyframe_id));
                 continue;
@@ -182,7 +182,7 @@ impl Window {
         }
     }
 
-    fn place_frame(&mut self, index: usize, frame: &TrackedFrame) -> Option<PlacedFrame> {
+    fn realign_frame(&mut self, index: usize, frame: &TrackedFrame) -> Option<RealignedFrame> {
         let keyframe = &self.keyframes[index];
         let (epoch, unit) = (keyframe.epoch, keyframe.unit);
         let host_from_map = keyframe.camera_from_map;
@@ -200,7 +200,7 @@ impl Window {
         self.push_camera(epoch, Arc::clone(&frame.pixels), camera_from_map, unit)?;
         let camera_from_map = self.align_frame(&members, frame.is_guess);
         self.keyframes.pop();
-        camera_from_map.map(|camera_from_map| PlacedFrame {
+        camera_from_map.map(|camera_from_map| RealignedFrame {
             sequence: frame.sequence,
             keyframe_id: frame.keyframe_id,
             keyframe_from_camera: host_from_map * camera_from_map.inverse(),
@@ -228,7 +228,7 @@ impl Window {
             }
         }
         best.filter(|&(inliers, compared, _)| {
-            inliers >= FEWEST_INLIERS && inliers as f64 >= LEAST_INLIER_RATIO * compared as f64
+            inliers >= MIN_INLIERS && inliers as f64 >= MIN_INLIER_RATIO * compared as f64
         })
         .map(|(.., camera_from_map)| camera_from_map)
     }
@@ -288,7 +288,7 @@ mod tests {
             pixels: seen.images[0].pixels().into(),
             ..frame(1)
         };
-        let placed = window.place_frame(1, &frame).unwrap();
+        let placed = window.realign_frame(1, &frame).unwrap();
         let error = (placed.keyframe_from_camera * truth.inverse()).log();
         assert!(error.norm() < 0.003, "{error}");
         assert_eq!(window.keyframes.len(), 3);
@@ -298,7 +298,7 @@ mod tests {
     fn frames_of_an_epochs_first_keyframes_wait_for_more_keyframes_but_not_for_all() {
         let left = |is_first| {
             let mut window = window();
-            window.place_frames(7, is_first);
+            window.realign_frames(7, is_first);
             window.frames.waiting.iter().map(|frame| frame.keyframe_id).collect::<Vec<_>>()
         };
         assert_eq!(left(true), [4, 5, 6, 7]);
@@ -321,7 +321,7 @@ mod tests {
         assert_eq!((left(&alone), alone.begin_frames()), (28, true));
         assert!(alone.optimise().is_none());
         assert_eq!((left(&alone), alone.begin_frames()), (1, false));
-        assert!(alone.take_frames_alone().is_some() && alone.take_frames_alone().is_none());
+        assert!(alone.take_planned_frames().is_some() && alone.take_planned_frames().is_none());
         // The next keyframe arrives before that.
         let mut overtaken = many();
         overtaken.plan_frames(7, false);

@@ -4,7 +4,7 @@ use crate::slam::depth::pattern::{PATTERN, sum_of_samples};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::shared::SharedImage;
-use crate::slam::window::comparison::{Look, SAMPLES};
+use crate::slam::window::comparison::{PatternAppearance, SAMPLES};
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::surface::Surface;
 
@@ -57,7 +57,7 @@ pub struct WindowPoint {
     /// 1/z along the host's optical axis, in 1 / unit of the map.
     pub inverse_depth: f64,
     /// Its appearance, by level.
-    pub looks: [Look; LEVELS],
+    pub appearances: [PatternAppearance; LEVELS],
     /// Number of keyframes that agreed when it was last adjusted.
     pub confirmations: u32,
     /// False once no keyframe agrees with it.
@@ -87,7 +87,7 @@ impl WindowKeyframe {
     }
 
     /// Creates its coarser images, unless it has them.
-    pub fn take_part(&mut self, camera: &Intrinsics) {
+    pub fn build_pyramid(&mut self, camera: &Intrinsics) {
         while self.images.len() < num_levels(camera) {
             let Some(finer) = self.images.last() else { return };
             self.images.push(finer.halved());
@@ -95,7 +95,7 @@ impl WindowKeyframe {
     }
 
     /// Frees its coarser images.
-    pub fn leave(&mut self) {
+    pub fn drop_pyramid(&mut self) {
         self.images.truncate(1);
     }
 }
@@ -116,14 +116,14 @@ impl WindowPoint {
         camera: &Intrinsics,
         params: &WindowParams,
     ) -> Self {
-        let mut looks = [Look::default(); LEVELS];
-        for (level, (look, image)) in looks.iter_mut().zip(images).enumerate() {
+        let mut appearances = [PatternAppearance::default(); LEVELS];
+        for (level, (appearance, image)) in appearances.iter_mut().zip(images).enumerate() {
             let [u, v] = [u, v].map(|pixel| at_level(pixel, level));
-            *look = look_at(image, u, v, params.half_weight_gradient);
+            *appearance = sample_pattern(image, u, v, params.half_weight_gradient);
         }
         let ray = camera.ray(f64::from(u), f64::from(v));
         let ray = [ray.x as f32, ray.y as f32];
-        Self { u, v, ray, inverse_depth, looks, confirmations: 0, is_alive: true }
+        Self { u, v, ray, inverse_depth, appearances, confirmations: 0, is_alive: true }
     }
 }
 
@@ -135,11 +135,16 @@ pub(super) fn at_level(pixel: u16, level: usize) -> f32 {
 
 /// Appearance of the pattern around a position of the image.
 #[inline(always)]
-pub(super) fn look_at(image: &SharedImage, u: f32, v: f32, half_weight_gradient: f32) -> Look {
+pub(super) fn sample_pattern(
+    image: &SharedImage,
+    u: f32,
+    v: f32,
+    half_weight_gradient: f32,
+) -> PatternAppearance {
     let reach = CENTRE as f32;
     let inside = |at: f32, side: usize| at >= reach && at < side as f32 - 1.0 - reach;
     if !(inside(u, image.width()) && inside(v, image.height())) {
-        return Look::default();
+        return PatternAppearance::default();
     }
     let around = around(image, u, v);
     let of_pattern = |from: &[f32; AROUND]| {
@@ -152,7 +157,7 @@ pub(super) fn look_at(image: &SharedImage, u: f32, v: f32, half_weight_gradient:
     let here = of_pattern(&around);
     let mean = sum_of_samples(&here) / SAMPLES as f32;
     if !(mean >= DARKEST) {
-        return Look::default();
+        return PatternAppearance::default();
     }
     let squared = half_weight_gradient * half_weight_gradient;
     let mut weights = [0.0; AROUND];
@@ -161,7 +166,7 @@ pub(super) fn look_at(image: &SharedImage, u: f32, v: f32, half_weight_gradient:
         let dv = 0.5 * (around[k + STRIDE] - around[k - STRIDE]);
         weights[k] = squared / (squared + du * du + dv * dv);
     }
-    Look { shape: here.map(|grey| grey / mean), weight: of_pattern(&weights) }
+    PatternAppearance { shape: here.map(|grey| grey / mean), weight: of_pattern(&weights) }
 }
 
 /// Pixels that pattern and differences reach to each side.

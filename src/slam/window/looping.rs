@@ -4,7 +4,7 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::loops::{Closure, LoopParams, Loops};
 use crate::slam::map::Map;
 use crate::slam::window::Window;
-use crate::slam::window::members::{Chosen, FEWEST_COMMON};
+use crate::slam::window::members::{Chosen, MIN_COMMON};
 
 /// Keyframes whose depth is incomplete: the one being observed, and the previous one, whose final depth is pending.
 const UNFINISHED: usize = 2;
@@ -31,7 +31,7 @@ impl Window {
     }
 
     /// Runs a search that was begun; false where none was.
-    pub(super) fn search_begun(&mut self) -> bool {
+    pub(super) fn run_search(&mut self) -> bool {
         let is_done = self.loops.run();
         if is_done {
             self.plan_search(self.num_unsettled());
@@ -40,12 +40,12 @@ impl Window {
     }
 
     /// Reports an estimate of the newest keyframes, right after it: which keyframes held the newest one.
-    pub(super) fn tell_estimate(&mut self, chosen: &Chosen) {
+    pub(super) fn report_estimate(&mut self, chosen: &Chosen) {
         let Some((&newest, others)) = chosen.members.split_last() else { return };
         let agreeing = self.agreeing_with_last(chosen);
         let of = |member: &usize| self.keyframes[*member].keyframe_id;
         // Those in its view but behind a wall hold nothing.
-        let holds = others.iter().zip(&agreeing).filter(|(_, count)| **count >= FEWEST_COMMON);
+        let holds = others.iter().zip(&agreeing).filter(|(_, count)| **count >= MIN_COMMON);
         let all: Vec<u64> = holds.map(|(member, _)| of(member)).collect();
         let fixed = others.iter().zip(&chosen.free).filter(|(_, free)| free.is_none());
         let held = fixed.map(|(member, _)| of(member)).filter(|id| all.contains(id));
@@ -85,7 +85,7 @@ impl Window {
     }
 
     /// Follows a closure: points move with their hosts, and a pass is due to estimate what the loop joins.
-    pub fn follow(&mut self, closure: &Closure) {
+    pub fn apply_closure(&mut self, closure: &Closure) {
         for keyframe in &mut self.keyframes {
             let Some(by) = closure.of(keyframe.keyframe_id, keyframe.epoch) else { continue };
             let place = *by * Sim3::new(keyframe.camera_from_map.inverse(), keyframe.unit);
@@ -93,6 +93,6 @@ impl Window {
             keyframe.unit = place.scale;
             keyframe.points.iter_mut().for_each(|point| point.inverse_depth /= by.scale);
         }
-        self.pass.call();
+        self.pass.request();
     }
 }

@@ -6,14 +6,14 @@ use super::Window;
 use super::keyframe::WindowKeyframe;
 use super::members::Chosen;
 use super::params::WindowParams;
-use super::place_marginals::PlaceMarginal;
+use super::place_marginals::KeyframePoseMarginal;
 use super::solver::Solver;
 use super::system::Members;
 use super::tests::{Room, noisy_room};
 use super::unit::Unit;
-use super::view::Sight;
+use super::view::ObserverView;
+use crate::slam::keyframe_pose_covariance::KEYFRAME_POSE_ERRORS;
 use crate::slam::mapper::modes::ModeParams;
-use crate::slam::place_covariance::PLACE_ERRORS;
 use crate::slam::test_scene::CAMERA;
 
 /// Modes of the error of a keyframe's depth: over its own points, or over those of the others as it sees them.
@@ -29,7 +29,8 @@ fn modes_of(room: &Room, truth: &Room, keyframe: usize) -> Vector3<f64> {
     };
     let seen = |room: &Room, host: usize| {
         let [to, from]: [&WindowKeyframe; 2] = [keyframe, host].map(|k| &room.keyframes[k]);
-        let sight = Sight::new(&(to.camera_from_map * from.camera_from_map.inverse()), &CAMERA);
+        let sight =
+            ObserverView::new(&(to.camera_from_map * from.camera_from_map.inverse()), &CAMERA);
         from.points.iter().map(|point| sight.project(point)).collect::<Vec<_>>()
     };
     if room.keyframes[keyframe].is_host {
@@ -82,7 +83,7 @@ fn marginals_match_the_scatter_of_the_modes_under_noise() {
 }
 
 /// Errors of a keyframe's place: the left increment of its pose, and the logarithm of the unit of its own depth.
-fn place_errors(room: &Room, truth: &Room, keyframe: usize) -> SVector<f64, PLACE_ERRORS> {
+fn place_errors(room: &Room, truth: &Room, keyframe: usize) -> SVector<f64, KEYFRAME_POSE_ERRORS> {
     let [found, exact] = [room, truth].map(|room| &room.keyframes[keyframe]);
     let pose = (found.camera_from_map.inverse() * exact.camera_from_map).log();
     let (mut fit, mut right) = (Matrix3::zeros(), Vector3::zeros());
@@ -94,7 +95,7 @@ fn place_errors(room: &Room, truth: &Room, keyframe: usize) -> SVector<f64, PLAC
             right += error * phi;
         }
     }
-    let mut errors = SVector::<f64, PLACE_ERRORS>::zeros();
+    let mut errors = SVector::<f64, KEYFRAME_POSE_ERRORS>::zeros();
     errors.fixed_rows_mut::<6>(0).copy_from(&pose);
     errors[6] = -(fit.try_inverse().unwrap() * right)[0];
     errors
@@ -102,9 +103,9 @@ fn place_errors(room: &Room, truth: &Room, keyframe: usize) -> SVector<f64, PLAC
 
 /// Ratios of the scatter under noise of the place of the last keyframe but one to its marginal's standard deviations,
 /// where the keyframes `held` hold the window.
-fn place_ratios(held: &[usize]) -> SVector<f64, PLACE_ERRORS> {
+fn place_ratios(held: &[usize]) -> SVector<f64, KEYFRAME_POSE_ERRORS> {
     const TIMES: u64 = 24;
-    let [mut sum, mut squares, mut said] = [SVector::<f64, PLACE_ERRORS>::zeros(); 3];
+    let [mut sum, mut squares, mut said] = [SVector::<f64, KEYFRAME_POSE_ERRORS>::zeros(); 3];
     for seed in 0..TIMES {
         let mut truth = noisy_room(|_, _| (1.0, 0.0), seed);
         truth.held = held.to_vec();
@@ -155,8 +156,10 @@ fn uncertainties_of_places_are_relative_to_the_unit_that_is_kept() {
     });
     assert!(shorter < 0.9 && (same - 1.0).abs() < 0.02, "{shorter} {same}");
     for (first, second) in first.iter().zip(&second) {
-        for of in [|place: &PlaceMarginal| place.noise, |place: &PlaceMarginal| place.of_displaced]
-        {
+        for of in [
+            |place: &KeyframePoseMarginal| place.noise,
+            |place: &KeyframePoseMarginal| place.of_displaced,
+        ] {
             let positions = |place| of(place).fixed_view::<3, 3>(0, 0).trace();
             let ratio = positions(first) / positions(second);
             assert!((0.9..1.1).contains(&ratio), "{ratio}");

@@ -20,16 +20,18 @@ use nalgebra::{
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::keyframe_pose_covariance::KeyframePoseMatrix;
 use crate::slam::modes::NUM_MODES;
-use crate::slam::place_covariance::PlaceMatrix;
 use crate::slam::window::Window;
 use crate::slam::window::comparison::{POSE, Pair};
 use crate::slam::window::functional::{Functional, Seen};
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint};
-use crate::slam::window::place_marginals::{Gauge, PlaceMarginal, place_of_displaced, unit_fit};
+use crate::slam::window::place_marginals::{
+    Gauge, KeyframePoseMarginal, covariance_of_displacement, unit_fit,
+};
 use crate::slam::window::solver::Solver;
 use crate::slam::window::system::{Members, System};
-use crate::slam::window::view::{MIN_DEPTH_RATIO, Sight, Views};
+use crate::slam::window::view::{MIN_DEPTH_RATIO, ObserverView, Views};
 
 /// Uncertainty of a jointly estimated keyframe, from the noise of the residuals alone: these are taken as independent,
 /// and the keyframes that hold the others in place as exact, which makes it overconfident.
@@ -43,15 +45,15 @@ pub struct Marginal {
     /// of points averages out.
     pub of_displaced: Matrix3<f64>,
     /// Its place; `None` where one keyframe alone holds the others and has no depth to hold their unit.
-    pub place: Option<PlaceMarginal>,
+    pub place: Option<KeyframePoseMarginal>,
 }
 
 /// Points that a fit of the modes needs: ten per parameter, as the plane.
-const FEWEST_POINTS: usize = 40;
+const MIN_POINTS: usize = 40;
 
 /// Standard deviation of a point's inverse depth, over that depth, above which it is not used for the modes: a few
 /// points without baseline would otherwise dominate their uncertainty.
-const LEAST_CERTAIN: f64 = 0.3;
+const MAX_RELATIVE_STD_DEV: f64 = 0.3;
 
 impl Window {
     /// The marginal of a keyframe by the last adjustment.
@@ -90,11 +92,12 @@ pub(super) fn marginals(
             let [unit] = functionals(&seen, unit_of, members, num_free, number)?;
             let map_from_camera = keyframe.camera_from_map.inverse();
             let errors = gauge.errors(&map_from_camera, number, &unit, whiten);
-            let noise = PlaceMatrix::from_fn(|i, j| variance * errors[i].dot(&errors[j]));
-            let of_displaced = place_of_displaced(&seen, &map_from_camera, camera, &fit, parallax);
-            Some(PlaceMarginal { noise, of_displaced })
+            let noise = KeyframePoseMatrix::from_fn(|i, j| variance * errors[i].dot(&errors[j]));
+            let of_displaced =
+                covariance_of_displacement(&seen, &map_from_camera, camera, &fit, parallax);
+            Some(KeyframePoseMarginal { noise, of_displaced })
         });
-        let place = place.filter(PlaceMarginal::is_finite);
+        let place = place.filter(KeyframePoseMarginal::is_finite);
         let keyframe_id = keyframe.keyframe_id;
         Some(Marginal { keyframe_id, modes, of_displaced: of_one / parallax, place })
     });
@@ -134,14 +137,14 @@ fn seen_by(
 ) -> Vec<Seen> {
     let to = &keyframes[members.members[member]];
     let mut seen = Vec::new();
-    let mut sight: Option<(usize, SE3, Sight)> = None;
+    let mut sight: Option<(usize, SE3, ObserverView)> = None;
     for (slot, (view, inliers)) in views.points.iter().zip(system.inliers_by_point()).enumerate() {
         if inliers == 0 || to.is_host != (view.host == member) {
             continue;
         }
         let host = &keyframes[members.members[view.host]];
         let point = &host.points[view.point];
-        if !(system.depth_deviation(slot) <= LEAST_CERTAIN * point.inverse_depth) {
+        if !(system.depth_deviation(slot) <= MAX_RELATIVE_STD_DEV * point.inverse_depth) {
             continue;
         }
         if view.host == member {
@@ -152,7 +155,7 @@ fn seen_by(
             Some(known) if known.0 == view.host => known,
             _ => {
                 let to_from_host = to.camera_from_map * host.camera_from_map.inverse();
-                sight.insert((view.host, to_from_host, Sight::new(&to_from_host, camera)))
+                sight.insert((view.host, to_from_host, ObserverView::new(&to_from_host, camera)))
             }
         };
         if sight.sees(point) {
@@ -226,7 +229,7 @@ fn mean_squared_parallax(
 
 /// The equations of the modes, with the constant, over points; `None` where these do not determine them.
 fn fit_of(seen: &[Seen]) -> Option<Cholesky<f64, Const<4>>> {
-    if seen.len() < FEWEST_POINTS {
+    if seen.len() < MIN_POINTS {
         return None;
     }
     seen.iter().map(|of| of.phi * of.phi.transpose()).sum::<Matrix4<f64>>().cholesky()

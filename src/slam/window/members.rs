@@ -4,10 +4,10 @@ use nalgebra::Vector3;
 
 use crate::slam::window::Window;
 use crate::slam::window::keyframe::WindowKeyframe;
-use crate::slam::window::view::Sight;
+use crate::slam::window::view::ObserverView;
 
 /// Points that two keyframes must have in common for one to hold the other in place.
-pub(super) const FEWEST_COMMON: usize = 20;
+pub(super) const MIN_COMMON: usize = 20;
 /// Share of the points of two keyframes that the other must see for an estimate to link them: for successive keyframes
 /// it is half and more; a few points at the border of an image hardly constrain a pose.
 const LINKING_SHARE: f64 = 0.2;
@@ -68,8 +68,7 @@ impl Window {
     fn is_linked(&self, one: usize, other: usize) -> bool {
         let alive = |of: usize| self.keyframes[of].points.iter().filter(|of| of.is_alive).count();
         let common = self.common(one, other) as f64;
-        common > FEWEST_COMMON as f64
-            && common >= LINKING_SHARE * (alive(one) + alive(other)) as f64
+        common > MIN_COMMON as f64 && common >= LINKING_SHARE * (alive(one) + alive(other)) as f64
     }
 
     /// Number of points of two keyframes that the other sees.
@@ -81,7 +80,7 @@ impl Window {
     fn seen_by(&self, host: usize, observer: usize) -> usize {
         let (host, observer) = (&self.keyframes[host], &self.keyframes[observer]);
         let observer_from_host = observer.camera_from_map * host.camera_from_map.inverse();
-        let sight = Sight::new(&observer_from_host, &self.camera);
+        let sight = ObserverView::new(&observer_from_host, &self.camera);
         if !sight.may_see(&host.points) {
             return 0;
         }
@@ -116,7 +115,7 @@ impl Window {
         let mut seen: Vec<(usize, usize)> = older
             .iter()
             .map(|&of| (newest.iter().map(|&new| self.common(of, new)).sum(), of))
-            .filter(|(count, _)| *count > FEWEST_COMMON)
+            .filter(|(count, _)| *count > MIN_COMMON)
             .collect();
         seen.sort_unstable_by(|one, other| other.cmp(one));
         seen.truncate(self.params.num_fixed);
@@ -129,10 +128,11 @@ impl Window {
         if of.len() <= NUM_NEAREST {
             return of.to_vec();
         }
-        let targets: Vec<Stand> = to.iter().map(|&to| Stand::of(&self.keyframes[to])).collect();
+        let targets: Vec<Viewpoint> =
+            to.iter().map(|&to| Viewpoint::of(&self.keyframes[to])).collect();
         let apart = |of: usize| {
-            let stand = Stand::of(&self.keyframes[of]);
-            targets.iter().map(|target| stand.apart(target)).sum::<f64>()
+            let stand = Viewpoint::of(&self.keyframes[of]);
+            targets.iter().map(|target| stand.dissimilarity(target)).sum::<f64>()
         };
         let mut places: Vec<(f64, usize)> =
             of.iter().enumerate().map(|(place, &of)| (apart(of), place)).collect();
@@ -147,13 +147,13 @@ impl Window {
 }
 
 /// A keyframe's position and the point that it looks at, in the map.
-struct Stand {
+struct Viewpoint {
     at: Vector3<f64>,
     /// In the centre of its image, at its mean depth.
     seen: Vector3<f64>,
 }
 
-impl Stand {
+impl Viewpoint {
     fn of(keyframe: &WindowKeyframe) -> Self {
         let map_from_camera = keyframe.camera_from_map.inverse();
         let at = map_from_camera.translation;
@@ -163,7 +163,7 @@ impl Stand {
     }
 
     /// Larger the less they see in common.
-    fn apart(&self, other: &Self) -> f64 {
+    fn dissimilarity(&self, other: &Self) -> f64 {
         (self.at - other.at).norm_squared() + (self.seen - other.seen).norm_squared()
     }
 }

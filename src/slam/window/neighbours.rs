@@ -8,7 +8,7 @@ use crate::slam::keyframe::DepthPoint;
 /// Standard deviation of the change of inverse depth from a pixel to the next on a slanted surface, relative to it.
 const SLANT: f64 = 0.005;
 /// Neighbours whose inverse depth differs by more than this many standard deviations are on another surface.
-const MOST_APART: f64 = 2.0;
+const MAX_DEVIATIONS: f64 = 2.0;
 /// Neighbours are at most this far in columns and in rows …
 const REACH_PX: usize = 2;
 /// … and this far in all, squared: the twenty around a pixel, without the corners.
@@ -56,7 +56,9 @@ impl<'a> Neighbourhood<'a> {
             let weight = 1.0 / (neighbour.own + slant);
             let is_sure = weight > 0.0 && weight.is_finite();
             others += 1.0;
-            if !(is_sure && squared <= MOST_APART * MOST_APART * (neighbour.most + single.most)) {
+            if !(is_sure
+                && squared <= MAX_DEVIATIONS * MAX_DEVIATIONS * (neighbour.most + single.most))
+            {
                 apart += 1.0;
                 continue;
             }

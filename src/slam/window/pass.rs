@@ -4,15 +4,15 @@
 //! a pass frees them too. A pass does what the conclusion does after the last frame, in smaller pieces.
 
 use crate::slam::map::{Correction, Map};
-use crate::slam::window::conclusion::MOST;
+use crate::slam::window::conclusion::MAX_NEWEST;
 use crate::slam::window::{Adjustment, Window};
 
 /// A change of the newest keyframe's unit (logarithm) or tilt (per unit of the ray's coordinates) above which those
 /// around it were estimated with a wrong one: in recordings one of 80 estimates after an epoch's first keyframes is
 /// beyond it, in rendered rooms none is beyond 0.02.
-const LEAST_JUMP: f64 = 0.1;
+const MIN_JUMP: f64 = 0.1;
 /// The same in standard deviations, where they are known.
-const LEAST_JUMP_SIGMAS: f64 = 5.0;
+const MIN_JUMP_SIGMAS: f64 = 5.0;
 
 /// The progress of a pass, and the reasons for the next.
 #[derive(Debug, Clone, Default)]
@@ -23,26 +23,26 @@ pub(super) struct Pass {
     /// A loop was closed: a pass is due, even where passes are disabled.
     is_called: bool,
     /// Where the pass continues; `None` where none is running.
-    next: Option<Place>,
+    next: Option<PieceStart>,
     /// The start of the piece that is being estimated.
-    piece: Option<Place>,
+    piece: Option<PieceStart>,
 }
 
 /// A keyframe that a piece begins with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Place {
+struct PieceStart {
     epoch: u32,
     keyframe_id: u64,
 }
 
 impl Pass {
     /// Calls for a pass from the beginning.
-    pub fn call(&mut self) {
+    pub fn request(&mut self) {
         (self.is_called, self.next) = (true, None);
     }
 
     /// The piece that was being estimated has entered.
-    pub fn leave_piece(&mut self) {
+    pub fn finish_piece(&mut self) {
         self.piece = None;
     }
 }
@@ -50,7 +50,7 @@ impl Pass {
 impl Window {
     /// Begins a piece of a pass, by [`Window::optimise`]; false where none is due. Call it when no new keyframe waits.
     pub fn begin_piece(&mut self) -> bool {
-        self.pass.leave_piece();
+        self.pass.finish_piece();
         let Some(newest) = self.keyframes.len().checked_sub(1) else { return false };
         let of_epoch = self.of_epoch_up_to(newest);
         let pass_every = self.params.pass_every;
@@ -58,8 +58,8 @@ impl Window {
         if !is_made || self.is_short(&of_epoch) {
             return false;
         }
-        let oldest = &self.keyframes[of_epoch[of_epoch.len().saturating_sub(MOST)]];
-        let start = Place { epoch: oldest.epoch, keyframe_id: oldest.keyframe_id };
+        let oldest = &self.keyframes[of_epoch[of_epoch.len().saturating_sub(MAX_NEWEST)]];
+        let start = PieceStart { epoch: oldest.epoch, keyframe_id: oldest.keyframe_id };
         let pass = &mut self.pass;
         // A pass over an epoch that was left, or joined to another, ends.
         pass.next = pass.next.filter(|next| next.epoch == start.epoch);
@@ -90,11 +90,11 @@ impl Window {
         let mut chosen = self.choose_piece(&of_epoch, begin, end);
         chosen.is_first = false;
         let adjustment = self.adjust(&chosen);
-        self.leave(&chosen.members);
+        self.free_unused_images(&chosen.members);
         // Each keyframe is free twice, among those before it and among those after it.
         let next = of_epoch.get(begin + length / 2).filter(|_| end < of_epoch.len());
         let keyframe_id = next.map(|&next| self.keyframes[next].keyframe_id);
-        self.pass.next = keyframe_id.map(|keyframe_id| Place { keyframe_id, ..piece });
+        self.pass.next = keyframe_id.map(|keyframe_id| PieceStart { keyframe_id, ..piece });
         adjustment
     }
 
@@ -112,7 +112,7 @@ impl Window {
 
     /// Watches a correction of the newest keyframes: where the newest one's unit or plane jumps, those before were
     /// estimated with a wrong one and a pass is due.
-    pub fn watch(&mut self, map: &Map, correction: &Correction) {
+    pub fn request_pass_on_jump(&mut self, map: &Map, correction: &Correction) {
         let Some(newest) = self.keyframes.len().checked_sub(1) else { return };
         if self.is_piece() || self.is_short(&self.of_epoch_up_to(newest)) {
             return;
@@ -129,7 +129,7 @@ impl Window {
             (is.depth.per_y, of_tilt.map(|of| of.y)),
         ];
         self.pass.has_jumped |= jumps.iter().any(|(by, deviation)| {
-            by.abs() > LEAST_JUMP.max(LEAST_JUMP_SIGMAS * deviation.unwrap_or(0.0))
+            by.abs() > MIN_JUMP.max(MIN_JUMP_SIGMAS * deviation.unwrap_or(0.0))
         });
     }
 }

@@ -7,9 +7,9 @@ use nalgebra::{Matrix3, Vector6};
 use super::tests::{exact_host, in_map};
 use super::*;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::keyframe_pose_covariance::KeyframePoseCovariance;
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
 use crate::slam::modes::ModeCovariance;
-use crate::slam::place_covariance::PlaceCovariance;
 use crate::slam::test_scene::{CAMERA, Scene};
 
 const KEYFRAMES: usize = 10;
@@ -157,7 +157,10 @@ fn a_jump_of_the_newest_plane_or_unit_beyond_its_sigma_calls_for_a_pass() {
             modes: Some(ModeCovariance::of_std_devs([std_dev; 3])),
             place: None,
         };
-        window.watch(&map, &Correction { keyframes: vec![newest], ..Correction::default() });
+        window.request_pass_on_jump(
+            &map,
+            &Correction { keyframes: vec![newest], ..Correction::default() },
+        );
         window.begin_piece()
     };
     assert!(begins(0.15, 0.0, 0.01) && begins(-0.15, 0.0, 0.01));
@@ -176,7 +179,8 @@ fn keyframes_that_a_piece_does_not_free_stay_and_so_do_new_ones() {
     map.keyframes.extend((0..=10).map(|id| in_map(id, 0, 0.1 * id as f64, 1.0)));
     // 4 was rejected: it follows 3.
     window.keyframes.remove(4);
-    let none = |_: &Marginal| (ModeCovariance::of(&Matrix3::zeros()), None::<PlaceCovariance>);
+    let none =
+        |_: &Marginal| (ModeCovariance::of(&Matrix3::zeros()), None::<KeyframePoseCovariance>);
     let correction = window.correction(&map, none);
     let corrected: BTreeSet<u64> = correction.keyframes.iter().map(|of| of.keyframe_id).collect();
     assert_eq!(corrected, moved.into_iter().collect());

@@ -14,7 +14,7 @@ use nalgebra::{Cholesky, Const, DVector, Matrix3};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::place_covariance::{PLACE_ERRORS, PlaceMatrix, transport};
+use crate::slam::keyframe_pose_covariance::{KEYFRAME_POSE_ERRORS, KeyframePoseMatrix, transport};
 use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::window::comparison::POSE;
 use crate::slam::window::functional::{Functional, Seen};
@@ -22,16 +22,16 @@ use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::system::{Members, System};
 use crate::slam::window::view::Views;
 
-/// Uncertainty of a keyframe's place (see `slam::place_covariance`), relative to those that held the window.
+/// Uncertainty of a keyframe's place (see `slam::keyframe_pose_covariance`), relative to those that held the window.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PlaceMarginal {
+pub struct KeyframePoseMarginal {
     /// From the noise of the residuals alone, taken as independent.
-    pub noise: PlaceMatrix,
+    pub noise: KeyframePoseMatrix,
     /// From a displacement of its image by a pixel along both axes, uniformly.
-    pub of_displaced: PlaceMatrix,
+    pub of_displaced: KeyframePoseMatrix,
 }
 
-impl PlaceMarginal {
+impl KeyframePoseMarginal {
     /// Transports it into the map that `by` moves this one to.
     pub(super) fn transport(&mut self, by: &Sim3) {
         let by = transport(by);
@@ -91,7 +91,7 @@ impl Gauge {
         number: usize,
         unit: &Functional,
         whiten: impl Fn(&Functional) -> DVector<f64>,
-    ) -> [DVector<f64>; PLACE_ERRORS] {
+    ) -> [DVector<f64>; KEYFRAME_POSE_ERRORS] {
         let by_increment = -map_from_camera.adjoint();
         std::array::from_fn(|row| {
             let mut of_pose = Functional::zero(unit.poses.len() / POSE);
@@ -131,18 +131,18 @@ pub(super) fn unit_fit(seen: &[Seen]) -> Option<Cholesky<f64, Const<3>>> {
 
 /// Covariance of a place whose points are `seen` by a displacement of the whole image by a pixel: of its pose as of a
 /// tracked frame's, of its unit by the parallax of its points.
-pub(super) fn place_of_displaced(
+pub(super) fn covariance_of_displacement(
     seen: &[Seen],
     map_from_camera: &SE3,
     camera: &Intrinsics,
     fit: &Cholesky<f64, Const<3>>,
     parallax: f64,
-) -> PlaceMatrix {
+) -> KeyframePoseMatrix {
     let num_points = seen.len() as f64;
     let mean_inverse_depth = seen.iter().map(|of| of.phi.w.exp()).sum::<f64>() / num_points;
     let by_camera = map_from_camera.adjoint();
     let of_pose = displacement_covariance(1.0, camera, mean_inverse_depth);
-    let mut of_place = PlaceMatrix::zeros();
+    let mut of_place = KeyframePoseMatrix::zeros();
     let mut pose = of_place.fixed_view_mut::<POSE, POSE>(0, 0);
     pose += by_camera * of_pose * by_camera.transpose();
     of_place[(POSE, POSE)] = fit.inverse()[(0, 0)] * num_points / parallax;

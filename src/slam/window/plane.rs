@@ -19,9 +19,9 @@ pub struct Correspondence {
 /// not differ by more than their noise.
 pub fn relief_left(points: &[Correspondence], plane: &[f64; 3]) -> f64 {
     /// Variance of depths beyond a plane over that of their noise, above which relief can be determined.
-    const LEAST_RATIO: f64 = 4.0;
+    const MIN_RELIEF_RATIO: f64 = 4.0;
     /// Largest relief: depth flattened by half. More is a wrong fit.
-    const MOST: f64 = 0.5;
+    const MAX_RELIEF: f64 = 0.5;
     let residual = |point: &Correspondence| {
         point.log_ratio - plane[0] - plane[1] * point.ray[0] - plane[2] * point.ray[1]
     };
@@ -44,28 +44,28 @@ pub fn relief_left(points: &[Correspondence], plane: &[f64; 3]) -> f64 {
     let covariance = (right.w - taken.dot(&right.fixed_view::<3, 1>(0, 0))) / total;
     // The keyframe's noise is in both, with opposite signs.
     let noise = spread * spread;
-    if !(variance > LEAST_RATIO * noise) {
+    if !(variance > MIN_RELIEF_RATIO * noise) {
         return 0.0;
     }
-    ((covariance + noise) / (variance - noise)).clamp(-MOST, MOST)
+    ((covariance + noise) / (variance - noise)).clamp(-MAX_RELIEF, MAX_RELIEF)
 }
 
 /// `log_ratio ≈ offset + per_x X + per_y Y` for most of the points: offset and slopes. A single offset where there are
 /// too few points for a plane, `None` where there are too few for that.
 pub fn fit(points: &[Correspondence]) -> Option<[f64; 3]> {
     /// Points that a plane needs: ten per parameter.
-    const FEWEST_FOR_PLANE: usize = 30;
+    const MIN_FOR_PLANE: usize = 30;
     /// Points that an offset needs.
-    const FEWEST_FOR_OFFSET: usize = 10;
+    const MIN_FOR_OFFSET: usize = 10;
     /// Iterations: the weights settle long before.
     const ITERATIONS: usize = 15;
     /// Largest slope: over an image 60° wide a factor of three from side to side. More is a wrong fit.
     const STEEPEST: f64 = 1.0;
-    if points.len() < FEWEST_FOR_OFFSET {
+    if points.len() < MIN_FOR_OFFSET {
         return None;
     }
     let middle = median(points.iter().map(|point| point.log_ratio).collect());
-    if points.len() < FEWEST_FOR_PLANE {
+    if points.len() < MIN_FOR_PLANE {
         return Some([middle, 0.0, 0.0]);
     }
     let mut plane = Vector3::new(middle, 0.0, 0.0);
@@ -100,8 +100,8 @@ fn weight_of(residual: f64) -> f64 {
 fn spread(sizes: Vec<f64>) -> f64 {
     const SIGMA_OF_MEDIAN: f64 = 1.4826;
     /// Depth is never known better than to a millionth.
-    const LEAST: f64 = 1e-6;
-    (SIGMA_OF_MEDIAN * median(sizes)).max(LEAST)
+    const MIN_SIGMA: f64 = 1e-6;
+    (SIGMA_OF_MEDIAN * median(sizes)).max(MIN_SIGMA)
 }
 
 /// The upper median; 0 for no values.

@@ -14,7 +14,7 @@ use crate::slam::window::system::Members;
 use crate::slam::window::{ADJUSTED_LEVELS, ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS, Window};
 
 /// Fewest keyframes to compare: two are explained by both motions, three nearly.
-const FEWEST_KEYFRAMES: usize = 4;
+const MIN_KEYFRAMES: usize = 4;
 /// Cost of the rival over that of the start below which the start is wrong. Wrong starts on the floor have 0.49 to
 /// 0.87, right ones of all recordings and rooms 1.21 and more.
 const REFUTED: f64 = 0.95;
@@ -22,7 +22,7 @@ const REFUTED: f64 = 0.95;
 /// more except for a few, which are checked to the end.
 const CONFIRMED: f64 = 1.4;
 /// Least share of the comparisons that the rival must make too: a rival that sees little costs little.
-const LEAST_COMPARED: f64 = 0.8;
+const MIN_COMPARED: f64 = 0.8;
 /// Least inverse depth of a point on the rival's plane, as a share of that on the optical axis: a plane may rise above
 /// the horizon.
 const FARTHEST: f64 = 0.1;
@@ -38,7 +38,7 @@ impl Window {
     /// Whether the rival of an epoch's start explains its first keyframes, which were just estimated, clearly better.
     pub(super) fn is_refuted(&mut self, chosen: &Chosen) -> bool {
         let epoch = self.keyframes[chosen.members[0]].epoch;
-        let is_early = chosen.members.len() < FEWEST_KEYFRAMES;
+        let is_early = chosen.members.len() < MIN_KEYFRAMES;
         if !chosen.is_first || is_early || self.confirmed_epoch == Some(epoch) {
             return false;
         }
@@ -49,8 +49,8 @@ impl Window {
             (keyframe.camera_from_map, keyframe.points.clone())
         };
         let kept: Vec<_> = chosen.members.iter().map(keep).collect();
-        let is_comparable = self.become_rival(chosen)
-            && self.solver.system.compared as f64 >= LEAST_COMPARED * compared as f64;
+        let is_comparable = self.estimate_rival(chosen)
+            && self.solver.system.compared as f64 >= MIN_COMPARED * compared as f64;
         let of_rival = self.mean_cost();
         for (&member, kept) in chosen.members.iter().zip(kept) {
             let keyframe = &mut self.keyframes[member];
@@ -71,7 +71,7 @@ impl Window {
     }
 
     /// Moves the first keyframes to their poses by the rival's motion and estimates them; false without a rival.
-    fn become_rival(&mut self, chosen: &Chosen) -> bool {
+    fn estimate_rival(&mut self, chosen: &Chosen) -> bool {
         let first = chosen.members[0];
         let map_from_first = self.keyframes[first].camera_from_map.inverse();
         let Some(plane) = self.plane_of(first) else { return false };
@@ -87,7 +87,7 @@ impl Window {
             return false;
         };
         let normal = widest.normal;
-        self.lie_on(first, &normal);
+        self.move_onto_plane(first, &normal);
         for (place, motion) in motions.iter().enumerate() {
             let member = chosen.members[place + 1];
             // Its plane is not that of the widest: convert to the unit of that one.
@@ -103,7 +103,10 @@ impl Window {
             }
             let camera_from_first = self.keyframes[member].camera_from_map * map_from_first;
             let turned = camera_from_first.rotation * normal;
-            self.lie_on(member, &(turned / (1.0 + turned.dot(&camera_from_first.translation))));
+            self.move_onto_plane(
+                member,
+                &(turned / (1.0 + turned.dot(&camera_from_first.translation))),
+            );
         }
         let members =
             Members { members: &chosen.members, free: &chosen.free, depths_are_free: true };
@@ -139,7 +142,7 @@ impl Window {
     }
 
     /// Moves a keyframe's points onto a plane in its camera.
-    fn lie_on(&mut self, member: usize, normal: &Vector3<f64>) {
+    fn move_onto_plane(&mut self, member: usize, normal: &Vector3<f64>) {
         let least = FARTHEST * normal.z.abs();
         for point in &mut self.keyframes[member].points {
             let ray = Vector3::new(f64::from(point.ray[0]), f64::from(point.ray[1]), 1.0);
@@ -164,8 +167,8 @@ impl PlaneMotion {
         let homography = homography / s2;
         let (a, c) = ((s1 / s2).powi(2) - 1.0, 1.0 - (s3 / s2).powi(2));
         /// Below this the two views differ only by a rotation.
-        const LEAST: f64 = 1e-9;
-        if !(a + c > LEAST) || !homography.iter().all(|x| x.is_finite()) {
+        const MIN_DIFFERENCE: f64 = 1e-9;
+        if !(a + c > MIN_DIFFERENCE) || !homography.iter().all(|x| x.is_finite()) {
             return None;
         }
         let (a, c) = (a.max(0.0), c.max(0.0));
@@ -237,7 +240,7 @@ mod tests {
         assert!(window.keyframes == right, "asking changes nothing");
         assert_eq!(window.confirmed_epoch, Some(0), "it is not asked about again");
         window.confirmed_epoch = None;
-        assert!(window.become_rival(&chosen));
+        assert!(window.estimate_rival(&chosen));
         assert!(window.is_refuted(&chosen));
     }
 }

@@ -1,7 +1,7 @@
 //! Checks whether an image shows the window's points from an assumed camera pose.
 
 use crate::slam::geometry::se3::SE3;
-use crate::slam::window::members::FEWEST_COMMON;
+use crate::slam::window::members::MIN_COMMON;
 use crate::slam::window::{ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS, Window};
 
 /// A camera's pose as determined by the points.
@@ -17,7 +17,7 @@ impl Window {
     /// Aligns an image to the points of the keyframes that see most of what it shows, from an initial pose on one of
     /// them, translation in that one's unit. `None` where too few points are in view, or the keyframe is unknown. The
     /// window does not change.
-    pub fn sight(
+    pub fn localise(
         &mut self,
         keyframe_id: u64,
         keyframe_from_camera: &SE3,
@@ -40,11 +40,11 @@ impl Window {
         let is_aligned = members.len() > 1
             && self.align_last(&members, &ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS);
         for of in at_rest {
-            self.keyframes[of].leave();
+            self.keyframes[of].drop_pyramid();
         }
         let placed = self.keyframes.pop()?;
         let system = &self.solver.system;
-        let is_seen = is_aligned && system.compared >= FEWEST_COMMON;
+        let is_seen = is_aligned && system.compared >= MIN_COMMON;
         is_seen.then(|| Sighting {
             keyframe_from_camera: scaled(
                 1.0 / unit,
@@ -79,14 +79,14 @@ mod tests {
         let (mut window, truth, pixels) = window_and_image();
         let before = window.keyframes.clone();
         let off = SE3::exp(&Vector6::new(0.01, 0.01, 0.0, 0.005, 0.005, 0.0));
-        let found = window.sight(1, &(off * truth), &pixels).unwrap();
+        let found = window.localise(1, &(off * truth), &pixels).unwrap();
         let error = (found.keyframe_from_camera * truth.inverse()).log().norm();
         assert!(error < 0.002 && found.agreeing > 0.9, "{error} {found:?}");
         assert!(window.keyframes == before, "asking changes nothing");
         // On a keyframe with another unit the pose is in that unit.
         window.keyframes[1].unit = 2.0;
         let halved = SE3 { translation: truth.translation * 0.5, ..truth };
-        let again = window.sight(1, &halved, &pixels).unwrap();
+        let again = window.localise(1, &halved, &pixels).unwrap();
         let apart = (again.keyframe_from_camera.translation - halved.translation).norm();
         assert!(apart < 0.001, "{apart}");
     }
@@ -95,11 +95,11 @@ mod tests {
     fn an_image_of_something_else_does_not_agree() {
         let (mut window, truth, _) = window_and_image();
         let elsewhere = Scene::new(8).render(&CAMERA, &SE3::identity()).noisy(2.0, 5);
-        let found = window.sight(1, &truth, &elsewhere).unwrap();
+        let found = window.localise(1, &truth, &elsewhere).unwrap();
         assert!(found.agreeing < 0.4, "{found:?}");
-        assert_eq!(window.sight(99, &truth, &elsewhere), None, "no such keyframe");
-        assert_eq!(window.sight(1, &truth, &elsewhere[1..]), None, "not of this camera");
+        assert_eq!(window.localise(99, &truth, &elsewhere), None, "no such keyframe");
+        assert_eq!(window.localise(1, &truth, &elsewhere[1..]), None, "not of this camera");
         let turned = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 3.0, 0.0));
-        assert_eq!(window.sight(1, &turned, &elsewhere), None, "nothing is in view");
+        assert_eq!(window.localise(1, &turned, &elsewhere), None, "nothing is in view");
     }
 }

@@ -14,9 +14,9 @@ const DAMPING_UP: f64 = 10.0;
 /// Damping of the first step, as a share of each diagonal element: small, so that soft modes are not frozen.
 const FIRST_DAMPING: f64 = 1e-3;
 /// Smallest damping: sums of f32 are exact to about a millionth, and the unit is held by nothing else.
-const LEAST_DAMPING: f64 = 1e-6;
+const MIN_DAMPING: f64 = 1e-6;
 /// Least damping of a step after one that failed.
-const LEAST_RAISED_DAMPING: f64 = 1e-3;
+const MIN_RAISED_DAMPING: f64 = 1e-3;
 /// Consecutive steps that may fail.
 const MAX_FAILURES: u32 = 5;
 /// Largest factor by which a step may change a depth, either way: beyond it the linearisation does not hold.
@@ -58,7 +58,7 @@ impl Solver {
                 if failures > MAX_FAILURES {
                     return false;
                 }
-                damping = (damping * DAMPING_UP).max(LEAST_RAISED_DAMPING);
+                damping = (damping * DAMPING_UP).max(MIN_RAISED_DAMPING);
                 continue;
             }
             let converged = converged_decrement * self.system.mean_squared_residual();
@@ -72,7 +72,7 @@ impl Solver {
             let moved = self.trial.linearise(keyframes, members, &self.views, at, before);
             if moved < cost {
                 std::mem::swap(&mut self.system, &mut self.trial);
-                (damping, failures) = ((damping * DAMPING_DOWN).max(LEAST_DAMPING), 0);
+                (damping, failures) = ((damping * DAMPING_DOWN).max(MIN_DAMPING), 0);
                 // The linear model may predict more than kinks between pixels allow.
                 let is_flat = cost - moved < converged;
                 cost = moved;
@@ -81,7 +81,7 @@ impl Solver {
                 }
             } else {
                 self.restore(keyframes, members);
-                damping = (damping * DAMPING_UP).max(LEAST_RAISED_DAMPING);
+                damping = (damping * DAMPING_UP).max(MIN_RAISED_DAMPING);
                 failures += 1;
                 if failures > MAX_FAILURES {
                     break;

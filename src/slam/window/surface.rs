@@ -11,7 +11,7 @@ const CELL_PX: usize = 32;
 /// One in this many points is used.
 const STEP: usize = 4;
 /// Fewest of these in a part for its depth to be known.
-const FEWEST: usize = 5;
+const MIN_CELL_POINTS: usize = 5;
 /// Share of these that may be beyond what is taken as the farthest: wrong matches, mostly.
 const OUTLIERS: f64 = 0.1;
 /// A point this many times as far as the farthest that is seen there is hidden. Depth and unit of a keyframe are more
@@ -52,7 +52,7 @@ impl Surface {
         }
         let least = parts.into_iter().map(|mut part| {
             let outliers = (OUTLIERS * part.len() as f64) as usize;
-            match part.len() >= FEWEST {
+            match part.len() >= MIN_CELL_POINTS {
                 true => *part.select_nth_unstable_by(outliers, f32::total_cmp).1,
                 false => 0.0,
             }

@@ -8,9 +8,9 @@ use super::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
-use crate::slam::map::PlacedFrame;
+use crate::slam::keyframe_pose_covariance::{KeyframePoseCovariance, KeyframePoseMatrix};
+use crate::slam::map::RealignedFrame;
 use crate::slam::modes::ModeCovariance;
-use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
 use crate::slam::test_scene::{CAMERA, Random, Rendering, Scene};
 use crate::slam::window::plane::Correspondence;
 
@@ -74,7 +74,7 @@ pub(super) fn exact_host(
         agreed: Vec::new(),
         surface: Surface::default(),
     };
-    keyframe.take_part(&CAMERA);
+    keyframe.build_pyramid(&CAMERA);
     let dense: Vec<DepthPoint> = (0..CAMERA.width * CAMERA.height)
         .map(|i| DepthPoint {
             u: (i % CAMERA.width) as u16,
@@ -144,7 +144,7 @@ impl Room {
         for level in ADJUSTED_LEVELS {
             let at = Level { camera: &CAMERA, level, robustness };
             solver.views.find(&self.keyframes, members.members, &CAMERA, |_, _| true);
-            solver.views.look(&self.keyframes, members.members, level);
+            solver.views.sample_patterns(&self.keyframes, members.members, level);
             assert!(solver.adjust(&mut self.keyframes, &members, &at, 15, 1e-4));
         }
         let inlier_ratio = solver.system.inliers as f64 / solver.system.compared as f64;
@@ -255,7 +255,7 @@ fn content_that_only_one_keyframe_shows_is_left_out() {
     }
     hidden.images =
         vec![SharedImage::try_from_pixels(CAMERA.width, CAMERA.height, pixels.into()).unwrap()];
-    hidden.take_part(&CAMERA);
+    hidden.build_pyramid(&CAMERA);
     hidden.points.clear();
     let mut right = truth.clone();
     right.keyframes[2].points.clear();
@@ -320,7 +320,7 @@ fn the_unit_is_kept_where_one_keyframe_holds_it() {
     let moved = longer.clone();
     let by = unit.restore(&mut longer.keyframes, members.members).unwrap();
     for (was, is) in moved.keyframes.iter().zip(&longer.keyframes) {
-        let was = by.place(&was.camera_from_map.inverse());
+        let was = by.transform_pose(&was.camera_from_map.inverse());
         assert!((is.camera_from_map * was).log().norm() < 1e-9);
     }
     let (translation, rotation, depth) = longer.errors(&truth);
@@ -407,8 +407,8 @@ fn keyframes_that_are_not_estimated_follow_the_last_moved_one_before_them() {
     let others = [(2, 0, 0.5), (3, 0, 1.0), (4, 0, 1.5), (5, 0, 2.0), (6, 0, 2.5), (7, 1, 0.0)];
     map.keyframes.extend(others.map(|(id, epoch, x)| in_map(id, epoch, x, 1.0)));
     // 6 follows 5: it gets the covariance of 5 plus its own relative to 5.
-    let [said, own] =
-        [1e-4, 4e-4].map(|of| PlaceCovariance::bounded(&(PlaceMatrix::identity() * of)));
+    let [said, own] = [1e-4, 4e-4]
+        .map(|of| KeyframePoseCovariance::bounded(&(KeyframePoseMatrix::identity() * of)));
     map.keyframes[3].points = depth;
     map.keyframes[4].place_covariance = own;
     let none = Matrix3::zeros();
@@ -438,19 +438,19 @@ fn keyframes_that_are_not_estimated_follow_the_last_moved_one_before_them() {
 fn a_frame_is_kept_in_the_unit_of_its_keyframe() {
     let mut map = Map::default();
     map.keyframes.push(in_map(3, 0, 1.0, 2.0));
-    let placed = |sequence, keyframe_id, x: f64| PlacedFrame {
+    let placed = |sequence, keyframe_id, x: f64| RealignedFrame {
         sequence,
         keyframe_id,
         keyframe_from_camera: SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() },
     };
     for of in [placed(9, 3, 5.0), placed(8, 3, 1.0), placed(9, 3, 3.0), placed(7, 4, 1.0)] {
-        map.place_frame(&of);
+        map.store_frame_pose(&of);
     }
     let kept: Vec<_> =
         map.frames.iter().map(|of| (of.sequence, of.keyframe_from_camera.translation.x)).collect();
     assert_eq!(kept, [(8, 0.5), (9, 1.5)]);
     assert_eq!(
-        map.place(3, &map.frame(9).unwrap().keyframe_from_camera).unwrap().translation.x,
+        map.frame_pose(3, &map.frame(9).unwrap().keyframe_from_camera).unwrap().translation.x,
         4.0
     );
     assert!(map.frame(7).is_none());

@@ -108,7 +108,8 @@ impl Views {
                     continue;
                 }
                 let map_from_host = keyframes[index].camera_from_map.inverse();
-                let sight = Sight::new(&(keyframes[other].camera_from_map * map_from_host), camera);
+                let sight =
+                    ObserverView::new(&(keyframes[other].camera_from_map * map_from_host), camera);
                 let first = self.slots.len();
                 let points = &keyframes[index].points;
                 let sees = |slot: &usize| sight.sees(&points[self.points[*slot].point]);
@@ -148,7 +149,12 @@ impl Views {
     }
 
     /// Fetches the appearance of the points at a level.
-    pub fn look(&mut self, keyframes: &[WindowKeyframe], members: &[usize], level: usize) {
+    pub fn sample_patterns(
+        &mut self,
+        keyframes: &[WindowKeyframe],
+        members: &[usize],
+        level: usize,
+    ) {
         self.patterns.clear();
         self.patterns.resize(self.slots.len() / LANES, Patterns::NONE);
         for pair in &self.pairs {
@@ -156,7 +162,7 @@ impl Views {
             for place in pair.places() {
                 let point = &points[self.points[self.slots[place]].point];
                 let patterns = &mut self.patterns[place / LANES];
-                patterns.set(place % LANES, &point.looks[level], point.ray);
+                patterns.set(place % LANES, &point.appearances[level], point.ray);
             }
         }
     }
@@ -182,13 +188,13 @@ impl Views {
 
 /// An observer's view of another keyframe's points.
 #[derive(Debug, Clone, Copy)]
-pub struct Sight {
+pub struct ObserverView {
     rotation: nalgebra::Matrix3<f64>,
     translation: Vector3<f64>,
     camera: Intrinsics,
 }
 
-impl Sight {
+impl ObserverView {
     /// Creates the view of an observer at this pose.
     pub fn new(observer_from_host: &SE3, camera: &Intrinsics) -> Self {
         Self {
@@ -221,14 +227,14 @@ impl Sight {
         };
         let (host, observer) = (turned.norm_squared(), scaled.norm_squared());
         let along = turned.dot(&scaled);
-        const MOST: f64 = MAX_DISTANCE_RATIO * MAX_DISTANCE_RATIO;
+        const MAX_SQUARED_RATIO: f64 = MAX_DISTANCE_RATIO * MAX_DISTANCE_RATIO;
         scaled.z >= MIN_DEPTH_RATIO
             && inside(scaled.x, fx, cx, width)
             && inside(scaled.y, fy, cy, height)
             && along > 0.0
             && along * along >= MIN_COSINE * MIN_COSINE * host * observer
-            && observer <= MOST * host
-            && host <= MOST * observer
+            && observer <= MAX_SQUARED_RATIO * host
+            && host <= MAX_SQUARED_RATIO * observer
     }
 
     /// False where the observer sees none of a sample of the points, spread over the image: most keyframes are turned

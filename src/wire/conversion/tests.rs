@@ -4,7 +4,7 @@ use nalgebra::Vector6;
 use proptest::prelude::*;
 
 use super::*;
-use crate::slam::place_covariance::PlaceMatrix;
+use crate::slam::keyframe_pose_covariance::KeyframePoseMatrix;
 use crate::slam::pose::{NO_KEYFRAME, Velocity};
 
 fn transform() -> SE3 {
@@ -46,7 +46,7 @@ fn keyframe() -> Keyframe {
         sequence: 30,
         capture_nanos: 1_000,
         mode_covariance: ModeCovariance::of_std_devs([0.01, 0.02, 0.05]),
-        place_covariance: PlaceCovariance::bounded(&(PlaceMatrix::identity() * 0.01)),
+        place_covariance: KeyframePoseCovariance::bounded(&(KeyframePoseMatrix::identity() * 0.01)),
         ..Keyframe::at(
             Sim3::new(transform(), 1.3),
             Intrinsics { fx: 20.0, fy: 21.0, cx: 9.5, cy: 8.5, width: 20, height: 18 },

@@ -27,13 +27,13 @@ pub(super) fn too_many<T: Part, H: Part>(
         }
         CallbackProgression::Continue
     });
-    let in_words = |id: &UniqueNodeId| {
+    let explain = |id: &UniqueNodeId| {
         let name = nodes.iter().find(|(known, _)| known == id).map(|(_, name)| name.as_str());
         let process =
             id.pid::<ipc::Service>().map_or("?".to_owned(), |pid| pid.value().to_string());
         format!("{} (process {process})", name.unwrap_or("a program"))
     };
-    let holders: Vec<String> = holders.iter().map(in_words).collect();
+    let holders: Vec<String> = holders.iter().map(explain).collect();
     OpenError::TooManySubscribers {
         topic: name.to_owned(),
         subscribers: service.static_config().max_subscribers(),

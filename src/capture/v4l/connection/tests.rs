@@ -8,7 +8,7 @@ use crate::capture::v4l::params::Setting;
 const FRAME_NANOS: i64 = 33_000_000;
 
 fn camera_with(fake: &Fake, params: CameraParams) -> Camera<Fake> {
-    let wish = Wish { width: 640, height: 480, format: None, rate_hz: Some(30.0) };
+    let wish = StreamRequest { width: 640, height: 480, format: None, rate_hz: Some(30.0) };
     Camera::new(fake.clone(), "0".to_owned(), params, wish)
 }
 

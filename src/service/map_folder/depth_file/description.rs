@@ -12,12 +12,12 @@ const FEATURE_BYTES: usize = 2 + 2 + 1 + 1 + 4 * 8;
 /// Bytes of the number of features, and of the checksum.
 const NUMBER_BYTES: usize = 4;
 /// Most bytes of a description.
-pub(super) const MOST_BYTES: usize = 2 * NUMBER_BYTES + MAX_FEATURES * FEATURE_BYTES;
+pub(super) const MAX_BYTES: usize = 2 * NUMBER_BYTES + MAX_FEATURES * FEATURE_BYTES;
 
 /// Encodes a description.
 pub(super) fn encode(description: &Description) -> Vec<u8> {
     let features = description.features();
-    let mut bytes = Vec::with_capacity(MOST_BYTES);
+    let mut bytes = Vec::with_capacity(MAX_BYTES);
     bytes.extend((features.len() as u32).to_le_bytes());
     for Feature { place, bits } in features {
         bytes.extend(place.u.to_le_bytes());

@@ -34,7 +34,7 @@ fn full_detail_is_read_back_bit_for_bit() {
         let of = keyframe(own);
         let bytes = encode(&of, MapDetail::Full);
         assert!(decoded(&bytes).unwrap() == of, "{own}");
-        assert!(bytes.len() <= most_bytes(WIDTH * HEIGHT));
+        assert!(bytes.len() <= max_file_bytes(WIDTH * HEIGHT));
     }
     let mut none = keyframe(0.0);
     none.points.clear();
@@ -177,8 +177,8 @@ fn files_of_the_previous_version_are_read() {
         let mut bits = vec![0u8; pixels::bit_bytes(WIDTH * HEIGHT)];
         let set = pixels::decode(places, WIDTH * HEIGHT, head.num_points as usize).unwrap();
         set.iter().for_each(|pixel| bits[pixel / 8] |= 1 << (pixel % 8));
-        let mut before = [&now[..HEAD_BYTES_BEFORE], &bits, rest].concat();
-        before[16] = VERSION_BEFORE as u8;
+        let mut before = [&now[..PREVIOUS_HEAD_BYTES], &bits, rest].concat();
+        before[16] = PREVIOUS_VERSION as u8;
         seal(&mut before);
         assert_eq!(crc32fast::hash(&before[..before.len() - 4]), checksum_of(&before));
         assert!(decoded(&before).unwrap() == decoded(&now).unwrap());

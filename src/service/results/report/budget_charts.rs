@@ -7,7 +7,7 @@ use crate::service::results::report::series::{Mark, Series};
 use crate::slam::evaluation::statistics::median;
 
 /// A smaller displacement counts as this: a hundredth of the accuracy of the alignment itself, pixels.
-const LEAST_PX: f64 = 1e-3;
+const MIN_PX: f64 = 1e-3;
 
 /// The time axis ends at this many times the median time of a whole frame: one frame delayed by another process would
 /// squeeze all others.
@@ -21,7 +21,7 @@ pub fn budget_charts(samples: &[BudgetSample], curve: Option<&BudgetCurve>) -> V
     let Some(curve) = curve else { return Vec::new() };
     let iterations = || curve.iterations.iter().map(|&n| f64::from(n));
     let by_iterations = |displacements: &[f64]| -> Vec<[f64; 2]> {
-        iterations().zip(displacements).map(|(n, &px)| [n, px.max(LEAST_PX)]).collect()
+        iterations().zip(displacements).map(|(n, &px)| [n, px.max(MIN_PX)]).collect()
     };
     let whole: Vec<f64> =
         samples.iter().filter_map(|s| s.last()).map(|step| step.nanos as f64 * 1e-6).collect();
@@ -30,7 +30,7 @@ pub fn budget_charts(samples: &[BudgetSample], curve: Option<&BudgetCurve>) -> V
         (0..=TIME_STEPS).map(|i| i as f64 / TIME_STEPS as f64 * longest).collect();
     let by_time = displacement_by_time(samples, &times);
     let share = |index: usize| -> Vec<[f64; 2]> {
-        by_time.iter().map(|(time, px)| [*time, px[index].max(LEAST_PX)]).collect()
+        by_time.iter().map(|(time, px)| [*time, px[index].max(MIN_PX)]).collect()
     };
     let mut by_iterations = chart(
         "Pose error by iterations",

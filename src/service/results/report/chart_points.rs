@@ -77,9 +77,9 @@ pub(super) fn points_json(frame: &Frame, series: &Series) -> String {
 /// A number with as many digits as the axis needs.
 pub(super) fn number(value: f64, axis: Range) -> String {
     /// Most decimals of a plain number.
-    const MOST_DECIMALS: f64 = 9.0;
+    const MAX_DECIMALS: f64 = 9.0;
     let decimals = -(axis.width() / STEPS).log10().floor();
-    if !(-MOST_DECIMALS..=MOST_DECIMALS).contains(&decimals) {
+    if !(-MAX_DECIMALS..=MAX_DECIMALS).contains(&decimals) {
         return format!("{value:e}");
     }
     without_zeros(&format!("{value:.*}", decimals.max(0.0) as usize)).to_owned()

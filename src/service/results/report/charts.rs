@@ -64,7 +64,7 @@ pub fn trajectory_charts(
 ) -> [Chart; 2] {
     let place = |pose: &StampedPose| StampedPose {
         nanos: pose.nanos,
-        world_from_camera: alignment.place(&pose.world_from_camera),
+        world_from_camera: alignment.transform_pose(&pose.world_from_camera),
     };
     let estimate: Vec<StampedPose> = estimate.iter().map(place).collect();
     let keyframes: Vec<StampedPose> = keyframes.iter().map(place).collect();

@@ -20,13 +20,13 @@ use crate::service::results::report::views::Views;
 use crate::service::results::summary_text::loops_text;
 use crate::slam::counted::counted;
 use crate::slam::keyframe::Keyframe;
-use crate::slam::loops::SearchFate;
+use crate::slam::loops::SearchOutcome;
 
 /// Radius of a loop that holds, and of a refused place.
 const LOOP_RADIUS: f64 = 4.0;
 const REFUSED_RADIUS: f64 = 2.5;
 /// Most loops that are drawn, the newest: what a path keeps without being thinned, three points each.
-const MOST_LINKS: usize = 1000;
+const MAX_DRAWN_LINKS: usize = 1000;
 
 /// Figures, reasons for refusals, and a view of the map from above; empty where no loop was searched for.
 pub fn loop_section(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
@@ -54,7 +54,7 @@ pub fn loop_section(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
 fn reasons(searches: &[SearchRecord]) -> Vec<(String, usize)> {
     let mut counts: BTreeMap<String, usize> = BTreeMap::new();
     for search in searches {
-        if let SearchFate::Refused(why) = search.report.fate {
+        if let SearchOutcome::Refused(why) = search.report.outcome {
             // Without the measured value.
             let why = why.to_string();
             let why = why.split(':').next().unwrap_or_default().to_owned();
@@ -80,8 +80,8 @@ fn seen_from_above(
         let keyframe = record.map.get(id).filter(is_shown)?;
         Some(views.seen_from_above(&keyframe.map_from_keyframe.rigid.translation))
     };
-    let of = |is: IsFate| -> Vec<[f64; 2]> {
-        let found = searches.iter().filter(|search| is(&search.report.fate));
+    let of = |is: IsOutcome| -> Vec<[f64; 2]> {
+        let found = searches.iter().filter(|search| is(&search.report.outcome));
         found.filter_map(|search| at(search.report.keyframe_id)).collect()
     };
     let links = record
@@ -90,7 +90,7 @@ fn seen_from_above(
         .links
         .iter()
         .rev()
-        .take(MOST_LINKS)
+        .take(MAX_DRAWN_LINKS)
         .filter_map(|link| Some([at(link.i)?, at(link.j)?]));
     // A broken line: one segment per loop.
     let links = links.flat_map(|[i, j]| [i, j, [f64::NAN; 2]]).collect();
@@ -114,20 +114,26 @@ fn seen_from_above(
 }
 
 /// Whether a search has a certain fate.
-type IsFate = fn(&SearchFate) -> bool;
+type IsOutcome = fn(&SearchOutcome) -> bool;
 
 /// Searches by their fate: `of` gives the positions of those with such a fate.
-fn place_series(of: &dyn Fn(IsFate) -> Vec<[f64; 2]>) -> [Series; 4] {
+fn place_series(of: &dyn Fn(IsOutcome) -> Vec<[f64; 2]>) -> [Series; 4] {
     let dots = |name, colour, radius, is| Series::new(name, colour, Mark::Dots(radius), of(is));
-    let is_other = |fate: &SearchFate| {
-        matches!(fate, SearchFate::Refused(_) | SearchFate::Unconfirmed | SearchFate::Inconsistent)
+    let is_other = |outcome: &SearchOutcome| {
+        matches!(
+            outcome,
+            SearchOutcome::Refused(_) | SearchOutcome::Unconfirmed | SearchOutcome::Inconsistent
+        )
     };
-    let is_too_far = |fate: &SearchFate| matches!(fate, SearchFate::AgainstDrift(_));
-    let moved_the_map = |fate: &SearchFate| matches!(fate, SearchFate::Closed | SearchFate::Joined);
+    let is_too_far = |outcome: &SearchOutcome| matches!(outcome, SearchOutcome::AgainstDrift(_));
+    let moved_the_map =
+        |outcome: &SearchOutcome| matches!(outcome, SearchOutcome::Closed | SearchOutcome::Joined);
     [
-        dots("other place", ERROR, REFUSED_RADIUS, is_other as IsFate),
+        dots("other place", ERROR, REFUSED_RADIUS, is_other as IsOutcome),
         dots("against the drift", ONLINE, REFUSED_RADIUS, is_too_far),
-        dots("held already", ESTIMATE, LOOP_RADIUS, |fate| *fate == SearchFate::Held),
+        dots("held already", ESTIMATE, LOOP_RADIUS, |outcome| {
+            *outcome == SearchOutcome::AlreadyConsistent
+        }),
         dots("closed or joined", MAPPING, LOOP_RADIUS, moved_the_map),
     ]
 }

@@ -36,7 +36,7 @@ const GROUND: Rgb = [16, 20, 27];
 const WAY: Rgb = [255, 255, 255];
 
 /// Smallest share of the picture's width for its scale bar; the largest is two and a half times as much.
-const LEAST_BAR: f64 = 0.14;
+const MIN_BAR_SHARE: f64 = 0.14;
 
 /// The map from above.
 #[derive(Debug, Clone, PartialEq)]
@@ -73,7 +73,7 @@ pub fn map_section(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
 
 /// A scale bar for a picture of this width, with its length, also in metres where the map unit is known.
 fn scale_bar(width: f64, unit: &str, metres_per_unit: Option<f64>) -> String {
-    let length = round_step(LEAST_BAR * width);
+    let length = round_step(MIN_BAR_SHARE * width);
     let metres = metres_per_unit.map(|scale| format!(" = {} m", significant(length * scale)));
     let unit = if length == 1.0 { unit.trim_end_matches('s') } else { unit };
     format!(

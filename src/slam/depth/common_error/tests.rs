@@ -68,7 +68,7 @@ fn assert_close(name: &str, found: &Vector3<f64>, expected: &Vector3<f64>) {
 fn modes_on_the_next_keyframe_match_its_true_errors() {
     let (map, camera, truth) = (depth(), small_camera(), pose());
     let samples = samples(&map);
-    let response = samples.carried(&truth, &camera).unwrap();
+    let response = samples.response_to_propagation(&truth, &camera).unwrap();
     for seed in 0..6 {
         let m = 1e-4 * twist(seed, 1.0).fixed_rows::<3>(0);
         let xi = twist(seed + 50, 1e-4);
@@ -99,10 +99,10 @@ fn depth_matched_at_a_wrong_pose_errs_by_what_cancels_the_residual() {
         hypothesis.inverse_depth *= 1.001;
         hypothesis.variance = 0.0;
     }
-    let response = samples.observed(&after, &truth).unwrap();
+    let response = samples.response_to_observation(&after, &truth).unwrap();
     // Points without gradient along their line keep their old error.
     assert!(response.on_modes.norm() < 0.3, "{}", response.on_modes);
-    let by_pose = samples.begun(&truth).unwrap();
+    let by_pose = samples.modes_by_pose(&truth).unwrap();
     for seed in 0..6 {
         let xi = twist(seed, 1e-4);
         let estimated = SE3::exp(&xi) * truth;
@@ -130,7 +130,7 @@ fn depth_matched_at_a_wrong_pose_errs_by_what_cancels_the_residual() {
 #[test]
 fn a_frame_without_observations_gives_no_response() {
     let map = depth();
-    assert_eq!(samples(&map).observed(&map, &pose()), None);
+    assert_eq!(samples(&map).response_to_observation(&map, &pose()), None);
 }
 
 #[test]
@@ -146,7 +146,7 @@ fn a_change_of_unit_does_not_affect_the_modes() {
     let (one, other) = (samples(&map), samples(&in_other_unit));
     // An error of the unit is carried over as an error of the unit if the pose follows it.
     let whole = |samples: &SampledDepth, pose: &SE3| {
-        let carried = samples.carried(pose, &camera).unwrap();
+        let carried = samples.response_to_propagation(pose, &camera).unwrap();
         carried.on_modes + carried.on_pose * samples.d_pose_d_modes(pose).unwrap()
     };
     let (of_one, of_other) = (whole(&one, &pose()), whole(&other, &shorter));
@@ -166,8 +166,8 @@ fn covariances_match_samples() {
         hypothesis.variance *= 0.5;
     }
     let follows = samples.d_pose_d_modes(&truth).unwrap();
-    let observed = samples.observed(&after, &truth).unwrap();
-    let carried = samples.carried(&truth, &camera).unwrap();
+    let observed = samples.response_to_observation(&after, &truth).unwrap();
+    let carried = samples.response_to_propagation(&truth, &camera).unwrap();
     let root = Matrix3::new(0.1, 0.0, 0.0, 0.03, 0.05, 0.0, -0.02, 0.04, 0.2);
     let std_devs: SVector<f64, 6> = Vector6::new(1e-3, 2e-3, 3e-3, 1e-3, 2e-3, 1e-3);
     let modes = root * root.transpose();

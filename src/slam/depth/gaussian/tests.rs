@@ -56,9 +56,9 @@ impl Fast {
         let matching = MatchingParams::default();
         let counts = observe(&mut map, &observer, &matching, params).counts;
         // Lists and pixels give the same counts.
-        let listed = map.hypotheses.count_beside(&map.candidates);
+        let listed = map.hypotheses.count_known_and_unknown(&map.candidates);
         map.hypotheses.pixels_mut();
-        assert_eq!(map.hypotheses.count_beside(&map.candidates), listed);
+        assert_eq!(map.hypotheses.count_known_and_unknown(&map.candidates), listed);
         (counts.created, map)
     }
 }

@@ -117,7 +117,7 @@ pub(super) fn solve_level(
     /// Damping after the first failed step; at or below this it returns to zero.
     const FIRST_DAMPING: f64 = 0.2;
     /// Consecutive failed steps before a level is given up.
-    const MOST_FAILURES: u32 = 6;
+    const MAX_FAILURES: u32 = 6;
     let weighed_at = *state;
     let mut best = (*state, sums(views, level, state, &weighed_at, params));
     let (mut damping, mut failures) = (0.0, 0);
@@ -142,7 +142,7 @@ pub(super) fn solve_level(
             }
         } else {
             failures += 1;
-            if failures > MOST_FAILURES || decrement < params.step_tolerance {
+            if failures > MAX_FAILURES || decrement < params.step_tolerance {
                 break;
             }
             damping =

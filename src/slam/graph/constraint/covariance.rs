@@ -62,18 +62,18 @@ impl Comparison {
     /// Correlation; `None` where there are too few grey values, or those of the first image are too uniform.
     fn correlation(&self) -> Option<f64> {
         /// Fewer grey values correlate by chance.
-        const LEAST_POINTS: f64 = 12.0;
+        const MIN_POINTS: f64 = 12.0;
         /// Variance of grey values, grey levels², that camera noise alone could cause.
-        const LEAST_VARIANCE: f64 = 16.0;
-        if self.count < LEAST_POINTS {
+        const MIN_VARIANCE: f64 = 16.0;
+        if self.count < MIN_POINTS {
             return None;
         }
         let mean = self.sums.map(|sum| sum / self.count);
         let variance = [0, 1].map(|k| self.squares[k] / self.count - mean[k] * mean[k]);
         let common = self.product / self.count - mean[0] * mean[1];
         // A uniform tile where texture was predicted does not agree.
-        (variance[0] > LEAST_VARIANCE)
-            .then(|| common / (variance[0] * variance[1].max(LEAST_VARIANCE)).sqrt())
+        (variance[0] > MIN_VARIANCE)
+            .then(|| common / (variance[0] * variance[1].max(MIN_VARIANCE)).sqrt())
     }
 }
 

@@ -16,9 +16,9 @@ use crate::slam::geometry::sim3::Sim3;
 const STEP: f64 = 0.05;
 const STEPS: i32 = 14;
 /// Least number of steps to another pose: nearer it is the same one.
-const LEAST_STEPS: i32 = 2;
+const MIN_STEPS: i32 = 2;
 /// Most poses that are refined.
-const MOST_FOLLOWED: usize = 4;
+const MAX_REFINED: usize = 4;
 /// Levels above the finest at which poses are scanned, and at which they are judged.
 const SCANNED_ABOVE: usize = 2;
 const JUDGED_ABOVE: usize = 1;
@@ -39,7 +39,7 @@ pub(super) fn has_rival(
         places.extend(minima(views, scanned, &found, &axis, params));
     }
     places.sort_by(|one, other| one.0.total_cmp(&other.0));
-    places.truncate(MOST_FOLLOWED);
+    places.truncate(MAX_REFINED);
     places.iter().any(|(_, place)| {
         let solved = (judged..=scanned).rev().try_fold(*place, |state, level| {
             solve_level(views, level, &state, params).map(|(state, _)| state)
@@ -71,7 +71,7 @@ fn minima(
     };
     let is_apart = |(_, state): &(f64, State)| {
         let steps = (state.rigid.translation - found.rigid.translation).norm() / (STEP * unit);
-        steps > f64::from(LEAST_STEPS) - 0.5
+        steps > f64::from(MIN_STEPS) - 0.5
     };
     costs.windows(3).filter(is_lowest).map(|around| around[1]).filter(is_apart).collect()
 }
@@ -80,7 +80,7 @@ fn minima(
 fn is_elsewhere(views: [&KeyframeView; 2], found: &State, state: &State) -> bool {
     let difference = state.rigid.translation - found.rigid.translation;
     let distance = difference.norm() * views[0].reference.mean_inverse_depth();
-    distance > STEP * f64::from(LEAST_STEPS)
+    distance > STEP * f64::from(MIN_STEPS)
 }
 
 /// Whether the images agree at a state.

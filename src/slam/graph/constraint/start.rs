@@ -9,7 +9,7 @@ use super::view::KeyframeView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::pose::Brightness;
-use crate::slam::tracker::motion::turned;
+use crate::slam::tracker::motion::rotations_around;
 use crate::slam::upper_median::upper_median;
 
 /// Rotations tried around a given one, degrees: half a step of those at which places are compared.
@@ -20,7 +20,7 @@ const ASIDE: f64 = 0.3;
 const GIVEN_DEG: f64 = 3.0;
 const GIVEN_ASIDE: f64 = 0.1;
 /// Candidates that are refined on the next finer level.
-const MOST_FOLLOWED: usize = 3;
+const MAX_REFINED: usize = 3;
 
 /// Initial estimate of a similarity before it is measured.
 #[derive(Debug, Clone, Copy)]
@@ -59,7 +59,7 @@ pub(super) fn find(
     let least = params.gates.min_usage * params.gates.min_inliers;
     solved.retain(|(explained, _)| *explained >= least);
     solved.sort_by(|one, other| other.0.total_cmp(&one.0));
-    solved.truncate(MOST_FOLLOWED);
+    solved.truncate(MAX_REFINED);
     let level = coarsest.saturating_sub(1).max(views[0].levels().start);
     let followed = solved.into_iter().filter_map(|(_, state)| follow(views, level, &state, params));
     let best = followed.reduce(|one, other| if other.0 > one.0 { other } else { one });
@@ -84,7 +84,8 @@ fn follow(
 fn around(at: &SE3, degrees: f64, aside: f64) -> Vec<SE3> {
     let turn_rad = degrees.to_radians();
     // From the left, in the axes of j: rotations of the camera about itself.
-    let mut poses: Vec<SE3> = turned(&SE3::identity(), turn_rad).map(|turn| turn * *at).collect();
+    let mut poses: Vec<SE3> =
+        rotations_around(&SE3::identity(), turn_rad).map(|turn| turn * *at).collect();
     for axis in [Vector3::x(), Vector3::y(), Vector3::z()] {
         for by in [-aside, aside] {
             let turn = turn_rad * by.signum();

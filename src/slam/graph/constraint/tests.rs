@@ -35,7 +35,7 @@ pub(in crate::slam) fn keyframe(
     error: &DepthError,
     seed: u64,
 ) -> Keyframe {
-    const LEAST_GRADIENT: f32 = 3.0;
+    const MIN_GRADIENT: f32 = 3.0;
     let view = scene.render(&CAMERA, world_from_camera);
     let image = view.noisy(2.0, seed);
     let mut random = Random::new(seed ^ 0xDE);
@@ -50,7 +50,7 @@ pub(in crate::slam) fn keyframe(
     let mut points = Vec::new();
     for (u, v) in pixels {
         let gradient = (grey(u + 1, v) - grey(u - 1, v)).hypot(grey(u, v + 1) - grey(u, v - 1));
-        if 0.5 * gradient < LEAST_GRADIENT {
+        if 0.5 * gradient < MIN_GRADIENT {
             continue;
         }
         let exact = f64::from(view.inverse_depth.at(u, v)) * unit;

@@ -66,7 +66,7 @@ pub enum Refusal {
     InvalidStart,
     /// No start makes the images agree.
     #[error("the images do not overlap")]
-    NothingAlike,
+    NoOverlap,
     /// No point falls into the other image.
     #[error("no point falls into the other image")]
     NothingInView,
@@ -78,7 +78,7 @@ pub enum Refusal {
     Undetermined,
     /// The gain is implausible.
     #[error("the gain between the images is not plausible")]
-    Gain,
+    ImplausibleGain,
     /// The cameras are too far apart.
     #[error("the cameras are too far apart")]
     TooFar,
@@ -112,7 +112,7 @@ impl GateParams {
     /// Judges one alignment.
     pub(super) fn judge(&self, found: &KeyframeAlignment) -> Result<(), Refusal> {
         let gates = [
-            (found.log_gain.abs() <= self.max_log_gain, Refusal::Gain),
+            (found.log_gain.abs() <= self.max_log_gain, Refusal::ImplausibleGain),
             (found.distance <= self.max_distance, Refusal::TooFar),
             (found.usage >= self.min_usage, Refusal::LittleOverlap),
             (found.inlier_share >= self.min_inliers, Refusal::FewInliers),

@@ -89,7 +89,7 @@ fn gradient<'a>(centre: &Surface, others: impl Iterator<Item = &'a Surface>) -> 
     /// Larger relative changes of inverse depth to a neighbour mean another surface.
     const SAME_SURFACE: f32 = 0.1;
     /// Least determinant of the sums of squares: six pixels around a corner.
-    const LEAST_DETERMINANT: f32 = 20.0;
+    const MIN_DETERMINANT: f32 = 20.0;
     let [mut uu, mut uv, mut vv, mut ud, mut vd] = [0.0f32; 5];
     for other in others {
         let d = other.inverse_depth - centre.inverse_depth;
@@ -104,7 +104,7 @@ fn gradient<'a>(centre: &Surface, others: impl Iterator<Item = &'a Surface>) -> 
         vd += v * d;
     }
     let determinant = uu * vv - uv * uv;
-    if determinant < LEAST_DETERMINANT {
+    if determinant < MIN_DETERMINANT {
         return [0.0; 2];
     }
     [(vv * ud - uv * vd) / determinant, (uu * vd - uv * ud) / determinant]

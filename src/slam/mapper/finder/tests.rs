@@ -27,7 +27,7 @@ fn a_known_view_is_found_on_its_keyframe_and_an_unknown_one_on_none() {
         let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
         let (index, found) =
             finder.find(&mut keyframes.to_vec(), Some(2), &mut searched, &pixels, &params)?;
-        let placed = keyframes[index].map_from_keyframe.place(&found);
+        let placed = keyframes[index].map_from_keyframe.transform_pose(&found);
         let error = (view.inverse() * placed).log().norm();
         assert!(error < 0.02, "found {error} away from where it is");
         Some(index)
@@ -123,13 +123,13 @@ fn keyframes_that_lost_their_depth_are_removed_from_the_index() {
     let pan = |k: u64| at([0.0, 0.0, 0.0, 0.0, 0.3 * k as f64, 0.0]);
     let mut keyframes: Vec<_> = (0..8).map(|k| keyframe(&scene, k, pan(k))).collect();
     let mut finder = Finder::new(&CAMERA);
-    finder.learn(&mut keyframes, usize::MAX);
+    finder.index_new(&mut keyframes, usize::MAX);
     assert_eq!(finder.places.len(), 8);
     let bytes = finder.places.bytes();
     for given_up in &mut keyframes[1..7] {
         *given_up = given_up.without_depth();
     }
-    finder.learn(&mut keyframes, MOST_LEARNT);
+    finder.index_new(&mut keyframes, MAX_INDEXED);
     let left: Vec<u64> = (0..8).filter(|id| finder.places.contains(*id)).collect();
     assert_eq!(left, [0, 7]);
     assert!(2 * finder.places.bytes() < bytes, "{bytes} B, now {}", finder.places.bytes());
@@ -140,12 +140,12 @@ fn a_keyframe_is_described_once_and_found_by_its_existing_description() {
     let scene = Scene::new(3);
     let away = at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]);
     let mut keyframes = [keyframe(&scene, 0, at([0.0; 6])), keyframe(&scene, 1, away)];
-    Finder::new(&CAMERA).learn(&mut keyframes, MOST_LEARNT);
+    Finder::new(&CAMERA).index_new(&mut keyframes, MAX_INDEXED);
     let made = keyframes.each_ref().map(|of| of.description.clone().unwrap());
     // Another finder uses the existing description, even where the image would give a different one.
     keyframes[0].description = Some(made[1].clone());
     let mut finder = Finder::new(&CAMERA);
-    finder.learn(&mut keyframes, usize::MAX);
+    finder.index_new(&mut keyframes, usize::MAX);
     assert!(Arc::ptr_eq(keyframes[0].description.as_ref().unwrap(), &made[1]));
     let found = finder.places.candidates(&made[0], 2, |_| false);
     assert!(found.iter().all(|of| of.score < 30.0), "{found:?}");

@@ -118,7 +118,7 @@ fn a_correction_right_after_relocalisation_keeps_the_odometry_pose() {
     let found = sideways(0.2);
     mapper.restore_keyframe(1, &found);
     let in_world = |mapper: &Mapper| {
-        mapper.keyframe().unwrap().world_from_keyframe.place(&found).translation.x
+        mapper.keyframe().unwrap().world_from_keyframe.transform_pose(&found).translation.x
     };
     assert!((in_world(&mapper) - 0.1).abs() < 1e-12, "{}", in_world(&mapper));
     // The two keyframes move apart.

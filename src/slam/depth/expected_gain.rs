@@ -52,7 +52,7 @@ struct Lines {
 /// Whether each pixel of row `v` is seen within a frame of `size` (width, height), and one match there promises to
 /// reduce its variance to the share `enough` or less.
 #[inline(always)]
-pub fn promises(
+pub fn worth_observing(
     pixels: &PixelLanes,
     v: f32,
     view: &TwoView,
@@ -63,7 +63,7 @@ pub fn promises(
 ) -> [bool; LANES] {
     let at = project(pixels, v, view, size);
     let lines = lines(&at, view);
-    let mut promises = [false; LANES];
+    let mut worth_observing = [false; LANES];
     let samples = PATTERN.len() as f32;
     let pixel_std_dev = params.noise.pixel_std_dev;
     let noise = (1.0 + gain * gain) * pixel_std_dev * pixel_std_dev;
@@ -94,12 +94,12 @@ pub fn promises(
             Uncertainty { variance: factor * match_variance, independent: factor * independent },
         )
         .left;
-        promises[k] = at.is_inside[k]
+        worth_observing[k] = at.is_inside[k]
             & lines.is_regular[k]
             & (information >= least)
             & !(left.variance > enough * variance);
     }
-    promises
+    worth_observing
 }
 
 #[inline(always)]
@@ -204,8 +204,15 @@ mod tests {
                     plane[k] = sum;
                 }
             }
-            let together =
-                promises(&pixels, v, &view, (camera.width, camera.height), gain, ENOUGH, &params);
+            let together = worth_observing(
+                &pixels,
+                v,
+                &view,
+                (camera.width, camera.height),
+                gain,
+                ENOUGH,
+                &params,
+            );
             for k in 0..LANES {
                 let line = view.line(pixels.u[k], v);
                 let alone = line
@@ -218,7 +225,8 @@ mod tests {
                     .is_some_and(|c| {
                         let (variance, independent) = (pixels.variance[k], pixels.independent[k]);
                         let known = Uncertainty { variance, independent };
-                        !(Gain::of(known, c.promise()).left.variance > ENOUGH * variance)
+                        !(Gain::of(known, c.predicted_uncertainty()).left.variance
+                            > ENOUGH * variance)
                     });
                 assert_eq!(together[k], alone, "motion {i}, pixel {k}");
                 kept += usize::from(alone);

@@ -21,7 +21,7 @@ pub struct Link {
 
 /// Loops of a map, and the keyframes that each was estimated against.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct KnownLoops {
+pub struct LoopRecord {
     /// Accepted loops, in the order in which they were found.
     pub links: Vec<Link>,
     /// By keyframe: the older ones that its pose was estimated against.
@@ -39,7 +39,7 @@ impl Link {
     }
 }
 
-impl KnownLoops {
+impl LoopRecord {
     /// Whether nothing is stored.
     pub fn is_empty(&self) -> bool {
         *self == Self::default()

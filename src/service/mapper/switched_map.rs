@@ -17,7 +17,7 @@ const MAX_BYTES: u64 = 1 << 15;
 /// A map that a mapper was not started with.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct GoneOver {
+pub(super) struct SwitchedMap {
     /// The folder configured when the mapper was started: a successor started with another one stays there.
     pub(super) from: String,
     /// The map.
@@ -26,7 +26,7 @@ pub(super) struct GoneOver {
     pub(super) numbering: Numbering,
 }
 
-impl GoneOver {
+impl SwitchedMap {
     /// Reads what the previous mapper left at `path`, if it was started like this one.
     pub(super) fn read(path: &Path, configured: &MapConfig) -> Option<Self> {
         let mut bytes = Vec::new();
@@ -67,15 +67,15 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rig.map");
         let config = |folder: &str| MapConfig { folder: folder.to_owned(), ..MapConfig::default() };
-        assert_eq!(GoneOver::read(&path, &config("/a")), None);
+        assert_eq!(SwitchedMap::read(&path, &config("/a")), None);
         let numbering = Numbering { ids: 3, epochs: 2, revisions: 1 };
-        let over = GoneOver { from: "/a".to_owned(), to: config("/b"), numbering };
+        let over = SwitchedMap { from: "/a".to_owned(), to: config("/b"), numbering };
         over.write(&path).unwrap();
-        assert_eq!(GoneOver::read(&path, &config("/a")), Some(over));
-        assert_eq!(GoneOver::read(&path, &config("/c")), None);
+        assert_eq!(SwitchedMap::read(&path, &config("/a")), Some(over));
+        assert_eq!(SwitchedMap::read(&path, &config("/c")), None);
         fs::write(&path, "{}").unwrap();
-        assert_eq!(GoneOver::read(&path, &config("/a")), None);
-        GoneOver::forget(&path);
+        assert_eq!(SwitchedMap::read(&path, &config("/a")), None);
+        SwitchedMap::forget(&path);
         assert!(!path.exists());
     }
 }
