@@ -31,15 +31,15 @@ class FrameHeader(ctypes.Structure):
 
     SIZE = 96
     _fields_ = [
-        # Number of the frame at its source; a gap is a frame that is missing.
+        # Number of the frame at its source; a gap means missing frames.
         ("sequence", ctypes.c_uint64),
         # Middle of the exposure, nanoseconds: CLOCK_MONOTONIC of a camera, else the recording's clock.
         ("capture_nanos", ctypes.c_int64),
-        # CLOCK_MONOTONIC instant that latency counts from: a camera's stamp, the paced instant of a recording, or the sending.
+        # CLOCK_MONOTONIC instant that latency counts from: a camera's stamp, a recording's paced instant, or the sending.
         ("clock_nanos", ctypes.c_int64),
-        # CLOCK_REALTIME at `clock_nanos`, as the system clock stood when the frame was sent; 0 where unknown.
+        # CLOCK_REALTIME at `clock_nanos`, by the system clock at the time of sending; 0 where unknown.
         ("realtime_nanos", ctypes.c_int64),
-        # CLOCK_MONOTONIC when it was sent: wake-ups are measured from here.
+        # CLOCK_MONOTONIC when it was sent; wake-up times count from here.
         ("sent_nanos", ctypes.c_int64),
         # Exposure time in nanoseconds, 0 where unknown.
         ("exposure_nanos", ctypes.c_uint64),
@@ -75,63 +75,63 @@ class PoseMessage(ctypes.Structure):
         ("published_nanos", ctypes.c_int64),
         # From the frame's `clock_nanos` to `published_nanos`.
         ("latency_nanos", ctypes.c_uint64),
-        # Time that tracking took.
+        # Tracking time.
         ("track_nanos", ctypes.c_uint64),
-        # From the sending of the frame to the tracker's look at it.
+        # From sending the frame to the tracker picking it up.
         ("wake_nanos", ctypes.c_uint64),
         # Revision of the keyframe it was tracked on.
         ("revision", ctypes.c_uint64),
         # Keyframe it was tracked on, all ones before the first.
         ("keyframe_id", ctypes.c_uint64),
-        # Life of the map.
+        # Epoch of the map.
         ("epoch", ctypes.c_uint32),
         # 0 initializing, 1 tracking, 2 degraded, 3 lost.
         ("state", ctypes.c_uint32),
-        # Why: degraded 0 budget, 1 low overlap, 2 high residual, 3 gap, 4 turning; lost 0 diverged, 1 too few inliers, 2 no points, 3 unusable frame, 4 map rejected; otherwise 0.
+        # Reason: degraded 0 budget, 1 low overlap, 2 high residual, 3 gap, 4 turning; lost 0 diverged, 1 too few inliers, 2 no points, 3 unusable frame, 4 map rejected; otherwise 0.
         ("reason", ctypes.c_uint32),
-        # 1 when the tracker asks for a new keyframe here.
+        # 1 if the tracker proposes a new keyframe here.
         ("proposes_keyframe", ctypes.c_uint32),
-        # How often the map had been corrected when the keyframe was published: `map_from_camera` jumps where this grows.
+        # Number of corrections of the map when the keyframe was published: `map_from_camera` jumps where this increases.
         ("map_revision", ctypes.c_uint64),
-        # Odometry pose: never jumps within an epoch, but from a turning pose to the next that is none, and drifts.
+        # Odometry pose: drifts, and never jumps within an epoch, except from a turning pose to the next that is not.
         ("world_from_camera", ctypes.c_double * 7),
         # Pose in the map, the best estimate: jumps where the map is corrected.
         ("map_from_camera", ctypes.c_double * 7),
         # Pose relative to the keyframe, keyframe units.
         ("keyframe_from_camera", ctypes.c_double * 7),
-        # Upper triangle, row-major, of the covariance of the left increment (translation, rotation) of `current_from_keyframe`, keyframe units and radians. Noise of single points, errors that the whole depth of the keyframe shares (its `mode_covariance`) and displacements of the whole image (`displacement_px`). Calibrated on simulated and recorded sequences: check the `nees_…` figures of a recording of your own before you fuse it. It does not hold the drift of the keyframe itself, nor that of the scale.
+        # Upper triangle, row-major, of the covariance of the left increment (translation, rotation) of `current_from_keyframe`, keyframe units and radians. Includes the noise of single points, the errors shared by all depth of the keyframe (its `mode_covariance`) and displacements of the whole image (`displacement_px`). Calibrated on simulated and recorded sequences: check the `nees_…` figures of your own recording before fusing it. Excludes the drift of the keyframe itself and of the scale.
         ("covariance", ctypes.c_double * 21),
-        # Upper triangle, row-major, of the covariance of the left increment ξ (translation, rotation) of `map_from_camera`, `exp(ξ) map_from_camera`, map units and radians: `covariance`, and the keyframe's `place_covariance`. The increment turns about the map's origin: a position p errs by ξ_t + ξ_ω × p. It is relative to the keyframes that held those that were estimated together: drift from before those is not in it.
+        # Upper triangle, row-major, of the covariance of the left increment ξ (translation, rotation) of `map_from_camera`, `exp(ξ) map_from_camera`, map units and radians: `covariance` and the keyframe's `place_covariance`. The increment rotates about the map's origin: a position p errs by ξ_t + ξ_ω × p. Relative to the keyframes that were held fixed in the joint estimate: earlier drift is not included.
         ("map_covariance", ctypes.c_double * 21),
-        # The same as `covariance` of the alignment alone, for the mapper. Too sure by up to a hundred in standard deviation: never fuse it.
+        # As `covariance`, but of the alignment alone, for the mapper. Overconfident by a factor of up to a hundred in standard deviation: never fuse it.
         ("alignment_covariance", ctypes.c_double * 21),
-        # Velocity of the camera at the frame's stamp, along its own axes (x right, y down, z forward), world units a second.
+        # Camera velocity at the frame's stamp, along its axes (x right, y down, z forward), world units per second.
         ("linear_velocity", ctypes.c_double * 3),
-        # The same about its own axes, radians a second.
+        # Angular velocity about the same axes, radians per second.
         ("angular_velocity", ctypes.c_double * 3),
-        # Upper triangle, row-major, of the covariance of both, linear first, without the error of the map's scale.
+        # Upper triangle, row-major, of the covariance of both, linear first; excludes the error of the map's scale.
         ("velocity_covariance", ctypes.c_double * 21),
-        # Brightness against the keyframe: a, b.
+        # Affine brightness relative to the keyframe: a, b.
         ("brightness", ctypes.c_double * 2),
         # Share of the keyframe's points in view.
         ("in_view_ratio", ctypes.c_double),
-        # Share of those compared that are explained.
+        # Share of inliers among the compared points.
         ("inlier_ratio", ctypes.c_double),
-        # Residual over its standard deviation.
+        # Huber-weighted root mean square of the residuals over their standard deviations.
         ("whitened_rmse", ctypes.c_double),
-        # Residual in grey levels.
+        # Root mean square of the residuals, grey levels.
         ("residual_rmse", ctypes.c_double),
         # Mean squared optical flow, pixels².
         ("mean_squared_flow", ctypes.c_double),
-        # Standard deviation by which the whole image may be displaced unseen, pixels; `covariance` holds it.
+        # Standard deviation of an undetected displacement of the whole image, pixels; included in `covariance`.
         ("displacement_px", ctypes.c_double),
-        # Iterations, all levels.
+        # Iterations over all levels.
         ("iterations", ctypes.c_uint32),
-        # Finest level that was solved; the number of all levels where none was.
+        # Finest level that was solved; the number of levels if none was.
         ("finest_level", ctypes.c_uint32),
         # Points compared: in view and not clipped by the sensor.
         ("points", ctypes.c_uint32),
-        # 1 where the velocity is known: this frame and the one before were tracked in one epoch; otherwise 0, and it is zero.
+        # 1 if the velocity is known (this frame and the previous one were tracked in one epoch); else 0, and it is zero.
         ("has_velocity", ctypes.c_uint32),
     ]
 
@@ -145,29 +145,29 @@ class KeyframeHeader(ctypes.Structure):
 
     SIZE = 488
     _fields_ = [
-        # Its id.
+        # Id of the keyframe.
         ("keyframe_id", ctypes.c_uint64),
-        # Counts up with every change of the map.
+        # Increases with every change of the map.
         ("revision", ctypes.c_uint64),
         # Sequence of its frame.
         ("sequence", ctypes.c_uint64),
         # Stamp of its frame, nanoseconds.
         ("capture_nanos", ctypes.c_int64),
-        # Where odometry has it, and its unit: poses follow from this.
+        # Pose and unit of the keyframe in odometry, from which poses follow.
         ("world_from_keyframe", ctypes.c_double * 8),
-        # Where the map has it, and its unit.
+        # Pose and unit of the keyframe in the map.
         ("map_from_keyframe", ctypes.c_double * 8),
-        # How often the map had been corrected by then.
+        # Number of corrections of the map by then.
         ("map_revision", ctypes.c_uint64),
         # fx, fy, cx, cy in pixels.
         ("intrinsics", ctypes.c_double * 4),
-        # Upper triangle, row-major, of the covariance of the errors that all of its depth shares: relative errors of inverse depth for each unit of X, of Y (the ray's coordinates) and of ln d.
+        # Upper triangle, row-major, of the covariance of the errors shared by all its depth: relative errors of inverse depth per unit of X, of Y (the ray's coordinates) and of ln d.
         ("mode_covariance", ctypes.c_double * 6),
-        # Upper triangle, row-major, of the covariance of the keyframe's place: of the left increment (translation, rotation) of the rigid part of `map_from_keyframe`, map units and radians, and of the logarithm of its unit.
+        # Upper triangle, row-major, of the covariance of the keyframe's pose and unit: the left increment (translation, rotation) of the rigid part of `map_from_keyframe`, map units and radians, and the logarithm of its unit.
         ("place_covariance", ctypes.c_double * 28),
-        # Life of the map.
+        # Epoch of the map.
         ("epoch", ctypes.c_uint32),
-        # 1 established, 2 rejected.
+        # State of the map: 1 established, 2 rejected.
         ("map_state", ctypes.c_uint32),
         # Width of its image, pixels.
         ("width", ctypes.c_uint32),
@@ -181,7 +181,7 @@ class KeyframeHeader(ctypes.Structure):
 
 
 class DepthPoint(ctypes.Structure):
-    """One pixel with depth, as it goes over the wire."""
+    """One pixel with depth, as sent over the wire."""
 
     SIZE = 16
     _fields_ = [
@@ -209,7 +209,7 @@ class KeyframeImageHeader(ctypes.Structure):
     _fields_ = [
         # The keyframe.
         ("keyframe_id", ctypes.c_uint64),
-        # Life of the map.
+        # Epoch of the map.
         ("epoch", ctypes.c_uint32),
         # Width in pixels.
         ("width", ctypes.c_uint32),
@@ -225,19 +225,19 @@ class KeyframeImageHeader(ctypes.Structure):
 
 
 class StepMessage(ctypes.Structure):
-    """Message of `mapper/step`: this frame is in the map."""
+    """Message of `mapper/step`: this frame has entered the map."""
 
     SIZE = 136
     _fields_ = [
         # Sequence of the frame.
         ("sequence", ctypes.c_uint64),
-        # The keyframe that is active from the next frame on, all ones before the first.
+        # Keyframe that is active from the next frame on, all ones before the first.
         ("keyframe_id", ctypes.c_uint64),
         # Its revision.
         ("revision", ctypes.c_uint64),
-        # Time that the step took.
+        # Duration of the step.
         ("step_nanos", ctypes.c_uint64),
-        # Time of it in which a new keyframe was made and published, once the frame was observed; 0 where none was.
+        # Part of it spent on making and publishing a new keyframe, after the frame was observed; 0 if there was none.
         ("change_nanos", ctypes.c_uint64),
         # Keyframes in the map.
         ("keyframes", ctypes.c_uint64),
@@ -245,13 +245,13 @@ class StepMessage(ctypes.Structure):
         ("points", ctypes.c_uint64),
         # Stamp of the last frame whose pose was claimed, nanoseconds.
         ("pose_nanos", ctypes.c_int64),
-        # That pose: where a tracker that is started again begins.
+        # That pose: a restarted tracker begins here.
         ("world_from_camera", ctypes.c_double * 7),
-        # 1 when there was such a frame in the epoch.
+        # 1 if there was such a frame in the epoch.
         ("has_pose", ctypes.c_uint32),
-        # Life of the map.
+        # Epoch of the map.
         ("epoch", ctypes.c_uint32),
-        # While there is no map, what the frame came to: 1 begun, 2 dark, 3 overexposed, 4 textureless, 5 unmatched, 6 still, 7 turned, 8 little parallax; otherwise 0.
+        # While there is no map, the outcome of the frame: 1 begun, 2 dark, 3 overexposed, 4 textureless, 5 unmatched, 6 still, 7 turned, 8 little parallax; otherwise 0.
         ("start_frame", ctypes.c_uint32),
         # Zero.
         ("reserved", ctypes.c_uint32),
@@ -267,11 +267,11 @@ class GraphHeader(ctypes.Structure):
 
     SIZE = 24
     _fields_ = [
-        # Newest revision of a keyframe in it.
+        # Newest revision among its keyframes.
         ("revision", ctypes.c_uint64),
-        # How often the map had been corrected by then.
+        # Number of corrections of the map by then.
         ("map_revision", ctypes.c_uint64),
-        # Life of the map.
+        # Epoch of the map.
         ("epoch", ctypes.c_uint32),
         # Zero.
         ("reserved", ctypes.c_uint32),
@@ -289,9 +289,9 @@ class KeyframePoseMessage(ctypes.Structure):
     _fields_ = [
         # The keyframe.
         ("keyframe_id", ctypes.c_uint64),
-        # Revision of its depth: another one than a reader has is asked for with a request.
+        # Revision of its depth; a reader that holds a different one sends a request for the keyframe.
         ("revision", ctypes.c_uint64),
-        # Where the map has it, and its unit.
+        # Pose and unit of the keyframe in the map.
         ("map_from_keyframe", ctypes.c_double * 8),
     ]
 
@@ -301,27 +301,27 @@ class KeyframePoseMessage(ctypes.Structure):
 
 
 class AdjustmentMessage(ctypes.Structure):
-    """Message of `mapper/adjustment`: a joint estimate of keyframes is over."""
+    """Message of `mapper/adjustment`: a joint estimate of keyframes has ended."""
 
     SIZE = 72
     _fields_ = [
         # Sequence of the last frame before it entered the map.
         ("sequence", ctypes.c_uint64),
-        # Frames from its beginning until then.
+        # Frames from its start until then.
         ("frames", ctypes.c_uint64),
-        # CPU time that it took, nanoseconds.
+        # CPU time of the estimate, nanoseconds.
         ("cpu_nanos", ctypes.c_uint64),
         # Newest keyframe that took part.
         ("keyframe_id", ctypes.c_uint64),
-        # Share of the comparisons of a point with a keyframe that count.
+        # Share of inliers among the comparisons of a point with a keyframe.
         ("inlier_ratio", ctypes.c_double),
-        # Root mean square of the residuals that count, grey levels.
+        # Root mean square of the inliers' residuals, grey levels.
         ("rms_grey", ctypes.c_double),
-        # What became of it: 0 it entered the map, 1 it entered a map with newer keyframes, which followed, 2 it was dropped because the map had changed.
+        # Outcome: 0 it entered the map, 1 it entered a map with newer keyframes, which moved with it, 2 it was dropped because the map had changed.
         ("fate", ctypes.c_uint32),
         # Keyframes whose poses were free.
         ("free", ctypes.c_uint32),
-        # Keyframes that held them in place.
+        # Keyframes that were fixed and held them in place.
         ("fixed", ctypes.c_uint32),
         # Points.
         ("points", ctypes.c_uint32),
@@ -349,21 +349,21 @@ class HealthMessage(ctypes.Structure):
         ("process_id", ctypes.c_uint32),
         # 0 starting, 1 preparing, 2 ready, 3 running, 4 finished, 5 failed, 6 stale.
         ("state", ctypes.c_uint32),
-        # Preparing: how much of the work is done.
+        # Preparing: work done so far.
         ("progress_done", ctypes.c_uint64),
-        # Preparing: how much work there is, 0 where unknown.
+        # Preparing: total work, 0 where unknown.
         ("progress_total", ctypes.c_uint64),
         # Frames sent, tracked or mapped.
         ("frames", ctypes.c_uint64),
-        # The same a second, over about the last second; NaN before one is over.
+        # Frames per second over about the last second; NaN before the first has passed.
         ("rate_hz", ctypes.c_double),
-        # Frames that came too late to be handled.
+        # Late frames that were skipped.
         ("dropped", ctypes.c_uint64),
-        # Frames that the source lost.
+        # Frames lost by the source.
         ("gaps", ctypes.c_uint64),
-        # Messages that were refused because they are broken.
+        # Messages refused as invalid.
         ("refused", ctypes.c_uint64),
-        # Frames whose sequence or stamp does not come after the one before: repeated, out of order, or after a jump of the source's clock.
+        # Frames whose sequence or stamp does not increase: repeated, out of order, or after a jump of the source's clock.
         ("disordered", ctypes.c_uint64),
         # Changes of the image size or the intrinsics.
         ("resized", ctypes.c_uint64),
@@ -371,39 +371,39 @@ class HealthMessage(ctypes.Structure):
         ("deadline_misses", ctypes.c_uint64),
         # Page faults of the frame loop since its first hundred frames.
         ("page_faults", ctypes.c_uint64),
-        # Capture: frames there will be, 0 where unknown. Mapper: keyframes of the map.
+        # Capture: total number of frames, 0 where unknown. Mapper: keyframes of the map.
         ("total", ctypes.c_uint64),
-        # State of the last frame: as in `PoseMessage`, or of the map: as in `KeyframeHeader`.
+        # State of the last frame, as in `PoseMessage`, or of the map, as in `KeyframeHeader`.
         ("detail", ctypes.c_uint32),
         # Bytes of `cause` that are used.
         ("cause_bytes", ctypes.c_uint32),
         # Largest resident memory so far.
         ("peak_rss_bytes", ctypes.c_uint64),
-        # How often each latency came, see `semidense::service::health`.
+        # Histogram of latencies, see `semidense::service::health`.
         ("latency_counts", ctypes.c_uint64 * 48),
-        # The same of the time that the work on a frame took.
+        # Histogram of the time spent on a frame.
         ("work_counts", ctypes.c_uint64 * 48),
-        # The same of the time from the sending of a frame to the look at it.
+        # Histogram of the time from sending a frame to picking it up.
         ("wake_counts", ctypes.c_uint64 * 48),
         # Mapper: joint estimates of keyframes that entered the map.
         ("adjustments", ctypes.c_uint64),
-        # Mapper: of them those that entered a map with newer keyframes, which followed.
+        # Mapper: of these, the ones that entered a map with newer keyframes, which moved with them.
         ("adjustments_merged", ctypes.c_uint64),
         # Mapper: joint estimates that were dropped because the map had changed.
         ("adjustments_dropped", ctypes.c_uint64),
-        # Mapper: the same as `latency_counts` of the CPU time of joint estimates.
+        # Mapper: histogram of the CPU time of joint estimates.
         ("adjustment_counts", ctypes.c_uint64 * 48),
-        # Mapper: keyframes that were looked for in older ones.
+        # Mapper: keyframes that were searched for among older ones.
         ("loop_searches", ctypes.c_uint64),
         # Mapper: loops that moved the map.
         ("loops_closed", ctypes.c_uint64),
-        # Mapper: loops that the map already had so.
+        # Mapper: loops that the map already agreed with.
         ("loops_held", ctypes.c_uint64),
         # Mapper: epochs that were joined to others.
         ("epochs_joined", ctypes.c_uint64),
-        # Mapper: keyframes whose candidates were other places.
+        # Mapper: keyframes whose candidates were different places.
         ("loops_refused", ctypes.c_uint64),
-        # Mapper: places that were further off than the map can have drifted.
+        # Mapper: places that were farther off than the map can have drifted.
         ("loops_against_drift", ctypes.c_uint64),
         # Mapper: places that no second pair confirmed.
         ("loops_unconfirmed", ctypes.c_uint64),
@@ -413,15 +413,15 @@ class HealthMessage(ctypes.Structure):
         ("scheduling", ctypes.c_uint32),
         # Priority of FIFO scheduling, else 0.
         ("priority", ctypes.c_uint32),
-        # 1 when the memory is locked.
+        # 1 if the memory is locked.
         ("memory_locked", ctypes.c_uint32),
         # Bytes of `warning` that are used.
         ("warning_bytes", ctypes.c_uint32),
         # What the system refused and which limit to raise, UTF-8.
         ("warning", ctypes.c_uint8 * 192),
-        # Why the state is what it is, UTF-8.
+        # Cause of the state, UTF-8.
         ("cause", ctypes.c_uint8 * 192),
-        # Capture: where its frames come from, as the user named it, UTF-8; long names lose their end.
+        # Capture: source of its frames as the user named it, UTF-8; long names are truncated.
         ("source", ctypes.c_uint8 * 192),
         # Bytes of `source` that are used.
         ("source_bytes", ctypes.c_uint32),
@@ -439,9 +439,9 @@ class CommandRequest(ctypes.Structure):
 
     SIZE = 4112
     _fields_ = [
-        # The keyframe that is asked for; otherwise 0.
+        # The requested keyframe; otherwise 0.
         ("keyframe_id", ctypes.c_uint64),
-        # 0 save the map to the file `path`, 1 send keyframe `keyframe_id` on `mapper/earlier_keyframe`, 2 save the map into the folder `path`, 3 go over to the map in the folder `path`, 4 only locate the camera in that.
+        # 0 save the map to the file `path`, 1 send keyframe `keyframe_id` on `mapper/earlier_keyframe`, 2 save the map to the folder `path`, 3 switch to the map in the folder `path`, 4 the same, but only localise the camera in it.
         ("kind", ctypes.c_uint32),
         # Bytes of `path` that are used.
         ("path_bytes", ctypes.c_uint32),
@@ -463,7 +463,7 @@ class CommandResponse(ctypes.Structure):
         ("status", ctypes.c_uint32),
         # Bytes of `text` that are used.
         ("text_bytes", ctypes.c_uint32),
-        # What failed, UTF-8.
+        # The error, UTF-8.
         ("text", ctypes.c_uint8 * 192),
     ]
 
