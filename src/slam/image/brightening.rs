@@ -9,6 +9,8 @@ const DIM_GREY: u8 = 64;
 /// The same of later images. A factor that changes within a run separates the views before and after it: with
 /// [`DIM_GREY`] here, a video with dim passages has 2.6 % fewer frames tracked than with a factor of 1 throughout.
 const LATER_DIM_GREY: u8 = DIM_GREY / 2;
+/// Grey level below which 90 % of an image lie that has just been brightened: room for light that comes into view.
+const BRIGHTENED_GREY: u8 = 160;
 /// Grey level below which 90 % of a brightened image stay, so that its light parts are not saturated.
 const BRIGHT_GREY: u8 = 224;
 /// Binary logarithm of the largest factor: beyond 8 grey levels are too coarse to be tracked on.
@@ -35,10 +37,22 @@ impl Brightening {
         1 << self.doublings
     }
 
-    /// Brightens the next frame, row-major with `width` columns. Frames that are not dim are left unchanged, and so are
-    /// those without any light.
+    /// Brightens the next frame, row-major with `width` columns. A frame without any light has no effect on the factor.
     pub fn apply(&mut self, pixels: &mut [u8], width: usize) {
-        let Some(bright) = bright_grey(pixels, width) else { return };
+        if let Some(bright) = bright_grey(pixels, width) {
+            self.adapt(bright);
+        }
+        if self.doublings > 0 {
+            let (factor, largest) = (self.factor(), u8::MAX >> self.doublings);
+            for pixel in pixels {
+                // Above the largest the result is saturated.
+                *pixel = if *pixel > largest { u8::MAX } else { *pixel * factor };
+            }
+        }
+    }
+
+    /// Adapts the factor to an image of which 90 % are darker than `bright`.
+    fn adapt(&mut self, bright: u8) {
         let brightened = |doublings: u8| u32::from(bright) << doublings;
         while self.doublings > 0 && brightened(self.doublings) > u32::from(BRIGHT_GREY) {
             self.doublings -= 1;
@@ -47,20 +61,14 @@ impl Brightening {
         let is_dim = brightened(self.doublings) < u32::from(limit);
         self.dim_frames = if is_dim { self.dim_frames.saturating_add(1) } else { 0 };
         if is_dim && (!self.has_begun || self.dim_frames >= DIM_FRAMES) {
-            while self.doublings < MAX_DOUBLINGS && brightened(self.doublings) < u32::from(DIM_GREY)
+            while self.doublings < MAX_DOUBLINGS
+                && brightened(self.doublings + 1) <= u32::from(BRIGHTENED_GREY)
             {
                 self.doublings += 1;
             }
             self.dim_frames = 0;
         }
         self.has_begun = true;
-        if self.doublings > 0 {
-            let (factor, largest) = (self.factor(), u8::MAX >> self.doublings);
-            for pixel in pixels {
-                // Above the largest the result is saturated.
-                *pixel = if *pixel > largest { u8::MAX } else { *pixel * factor };
-            }
-        }
     }
 }
 
@@ -135,8 +143,8 @@ mod tests {
         assert_eq!(brightening.factor(), 1);
         brightened(&mut brightening, &ramp(30));
         assert_eq!(brightening.factor(), 4);
-        // A covered lens keeps it.
-        brightened(&mut brightening, &black);
+        // A covered lens keeps it, and the frames before and after it are equally bright.
+        assert_eq!(brightened(&mut brightening, &black), [12; WIDTH * 120]);
         assert_eq!(brightening.factor(), 4);
     }
 
