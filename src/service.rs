@@ -3,6 +3,7 @@
 pub mod adjustments;
 pub mod alignment_stamps;
 pub mod atomic_file;
+pub(crate) mod brighten;
 pub(crate) mod budget;
 pub(crate) mod bytes;
 pub(crate) mod capture;

@@ -7,6 +7,7 @@ use crate::capture::opening::{open, rig_remarks};
 use crate::capture::source::{Arrival, FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
 use crate::capture::source_name::SourceName;
+use crate::service::brighten::brighten;
 use crate::service::child::{is_supervised, prepared_frames};
 use crate::service::clock::{Pace, duration_from_nanos, now_nanos, realtime_of};
 use crate::service::config::Config;
@@ -416,19 +417,6 @@ impl<'a> Shell<'a> {
         self.frames.serve_late_joiners();
         self.health.report();
         if self.shutdown.is_requested() { Err(RunError::Interrupted) } else { Ok(()) }
-    }
-}
-
-/// Brightens a dim image and logs a change of the factor.
-fn brighten(brightening: &mut Brightening, pixels: &mut [u8], width: usize) {
-    let before = brightening.factor();
-    brightening.apply(pixels, width);
-    match brightening.factor() {
-        factor if factor == before => {}
-        1 => tracing::info!("capture: the images are bright enough again"),
-        factor => tracing::warn!(
-            "capture: the images are dim; their grey levels are multiplied by {factor}. Add light or expose longer"
-        ),
     }
 }
 

@@ -6,6 +6,7 @@ use crossbeam::channel::{Receiver, Sender, bounded};
 
 use crate::capture::source::{FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
+use crate::service::brighten::brighten;
 use crate::slam::image::brightening::Brightening;
 use crate::slam::image::buffer::Image;
 
@@ -99,7 +100,7 @@ fn read(
         if let Ok(Some(_)) = stamp {
             num_read += 1;
             if let Some(brightening) = &mut brightening {
-                brightening.apply(&mut pixels, width);
+                brighten(brightening, &mut pixels, width);
             }
         }
         if to_taker.send(ReadFrame { stamp, pixels, sensor_depth }).is_err() || is_last {
