@@ -214,7 +214,8 @@ def test_json_has_every_pose(running: Rig) -> None:
 
 def test_too_many_readers_are_told_who_has_the_places(running: Rig) -> None:
     readers = []
-    with pytest.raises(semidense.TooManyReaders, match=rf"capture/frame has \d+ subscribers.*process {os.getpid()}"):
+    expected = rf"capture/frame already has its maximum of \d+ subscribers.*process {os.getpid()}"
+    with pytest.raises(semidense.TooManyReaders, match=expected):
         for _ in range(20):
             readers.append(Reader(Frame, **options(running)))
     for reader in readers:
