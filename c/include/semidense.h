@@ -303,8 +303,7 @@ enum semidense_status semidense_next_pose(struct semidense_reader *reader, struc
 //
 // # Safety
 // `frame` is null or valid for writes.
-enum semidense_status semidense_newest_frame(struct semidense_reader *reader,
-                                             struct semidense_frame *frame);
+enum semidense_status semidense_newest_frame(struct semidense_reader *reader, struct semidense_frame *frame);
 
 // Reads the newest keyframe or revision of its depth, if unread: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The
 // previous one becomes invalid, whatever is returned. A late reader receives the active keyframe.
@@ -318,8 +317,7 @@ enum semidense_status semidense_newest_keyframe(struct semidense_reader *reader,
 //
 // # Safety
 // `graph` is null or valid for writes.
-enum semidense_status semidense_newest_graph(struct semidense_reader *reader,
-                                             struct semidense_graph *graph);
+enum semidense_status semidense_newest_graph(struct semidense_reader *reader, struct semidense_graph *graph);
 
 // Number of messages refused because they are malformed; 0 after an error.
 uint64_t semidense_refused(const struct semidense_reader *reader);
