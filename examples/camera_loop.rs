@@ -6,7 +6,8 @@
 //! ```
 //!
 //! The recording has a quarter of the size; vivid's scaler copies pairs of pixels, so each pixel is repeated four
-//! times. The node keeps the last picture it was given, so any pace will do. `watch` reads every frame that capture
+//! times. The node keeps the last picture it was given, so any pace will do: `feed` gives the next one once the mapper
+//! has seen the last, however slow the machine is, and at most at the given rate. `watch` reads every frame that capture
 //! sends, finds which picture it is, pixel for pixel, and writes that picture's true pose with the camera's stamp.
 
 use std::collections::HashMap;
@@ -14,17 +15,17 @@ use std::error::Error;
 use std::io::Write;
 use std::path::Path;
 use std::process::ExitCode;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use semidense::capture::opening::{SourceParams, open};
 use semidense::capture::source::FrameSource;
 use semidense::service::shutdown::Shutdown;
 use semidense::service::trajectory_file::write_trajectory;
 use semidense::slam::trajectory::StampedPose;
-use semidense::wire::message::FrameHeader;
+use semidense::wire::message::{FrameHeader, StepMessage};
 use semidense::wire::place::Place;
 use semidense::wire::port::{Access, Hub, Subscriber, wait};
-use semidense::wire::topic::FRAME;
+use semidense::wire::topic::{FRAME, STEP};
 
 /// Factor by which the output's pictures are larger, along each side.
 const SCALE: usize = 4;
@@ -72,6 +73,42 @@ fn enlarged(pixels: &[u8], width: usize) -> Vec<u8> {
     large
 }
 
+fn join() -> Result<Hub, Box<dyn Error>> {
+    let instance = std::env::var("SEMIDENSE_INSTANCE").unwrap_or_else(|_| "semidense".to_owned());
+    Ok(Hub::join(&Place::new(&instance, "")?, "camera_loop", Access::Observer)?)
+}
+
+/// The mapper's steps, once there are processes that it can be asked of.
+#[derive(Default)]
+struct Steps(Option<(Hub, Subscriber<StepMessage, ()>)>);
+
+impl Steps {
+    /// Waits until the mapper has seen a picture that was given just now.
+    fn await_picture(&mut self) -> Result<(), Box<dyn Error>> {
+        /// The first step may be that of a frame before it.
+        const NUM_STEPS: usize = 2;
+        /// Longest wait: there may be no mapper, or it starts again.
+        const MAX_WAIT: Duration = Duration::from_secs(10);
+        if self.0.is_none() {
+            let joined = join().and_then(|hub| {
+                let steps = hub.subscriber(&STEP)?;
+                Ok((hub, steps))
+            });
+            self.0 = joined.ok();
+        }
+        let Some((_, steps)) = &self.0 else { return Ok(()) };
+        while steps.receive()?.is_some() {}
+        let (begin, mut num_steps) = (Instant::now(), 0);
+        while num_steps < NUM_STEPS && begin.elapsed() < MAX_WAIT {
+            wait(&[steps.events()], None, MAX_WAIT.saturating_sub(begin.elapsed()))?;
+            while steps.receive()?.is_some() {
+                num_steps += 1;
+            }
+        }
+        Ok(())
+    }
+}
+
 /// Back and forth, indefinitely: the camera never jumps.
 fn feed(source: &str, rate_hz: &str) -> Result<(), Box<dyn Error>> {
     let mut source = open(&source.parse()?, None, &SourceParams::default())?;
@@ -81,10 +118,14 @@ fn feed(source: &str, rate_hz: &str) -> Result<(), Box<dyn Error>> {
     let mut output = std::io::stdout().lock();
     let back = (1..pictures.len().saturating_sub(1)).rev();
     let order: Vec<usize> = (0..pictures.len()).chain(back).collect();
+    let mut steps = Steps::default();
     loop {
         for &index in &order {
+            let due = Instant::now() + period;
             output.write_all(&enlarged(&pictures[index].1, width))?;
-            std::thread::sleep(period);
+            output.flush()?;
+            steps.await_picture()?;
+            std::thread::sleep(due.saturating_duration_since(Instant::now()));
         }
     }
 }
@@ -96,8 +137,7 @@ fn watch(source: &str, truth: &str) -> Result<(), Box<dyn Error>> {
         source.ground_truth().iter().map(|pose| (pose.nanos, *pose)).collect();
     let index_of: HashMap<&[u8], usize> =
         pictures.iter().enumerate().map(|(index, (_, pixels))| (&pixels[..], index)).collect();
-    let instance = std::env::var("SEMIDENSE_INSTANCE").unwrap_or_else(|_| "semidense".to_owned());
-    let hub = Hub::join(&Place::new(&instance, "")?, "camera_loop", Access::Observer)?;
+    let hub = join()?;
     let subscriber: Subscriber<u8, FrameHeader> = hub.subscriber(&FRAME)?;
     let shutdown = Shutdown::install()?;
     let (mut exact, mut unknown, mut repeated, mut last) = (0, 0, 0, None);
