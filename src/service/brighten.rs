@@ -1,16 +1,258 @@
-//! Brightens dim images as they are read, and logs it.
+//! A source whose dim images are brightened as they are read, which is logged.
 
-use crate::slam::image::brightening::Brightening;
+use std::collections::VecDeque;
+use std::fs::File;
+use std::ops::DerefMut;
+use std::os::fd::BorrowedFd;
 
-/// Brightens a dim image and logs a change of the factor.
-pub(crate) fn brighten(brightening: &mut Brightening, pixels: &mut [u8], width: usize) {
-    let before = brightening.factor();
-    brightening.apply(pixels, width);
-    match brightening.factor() {
-        factor if factor == before => {}
-        1 => tracing::info!("the images are bright enough again"),
-        factor => tracing::warn!(
-            "the images are dim; their grey levels are multiplied by {factor}. Add light or expose longer"
-        ),
+use crate::capture::source::{Arrival, FrameLosses, FrameSource, FrameStamp, Notice};
+use crate::capture::source_error::SourceError;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::image::brightening::{Brightening, Light, SETTLING_FRAMES};
+use crate::slam::image::buffer::Image;
+use crate::slam::trajectory::StampedPose;
+
+/// The frames of a source, brightened where they are dim. While its first frames are dim it reads a few ahead, to see
+/// whether the exposure still settles.
+pub(crate) struct Brightened<S> {
+    source: S,
+    brightening: Brightening,
+    /// Frames that were read ahead, in order.
+    ahead: VecDeque<AheadFrame>,
+}
+
+/// A frame that was read ahead, or why there is none.
+struct AheadFrame {
+    stamp: Result<Option<FrameStamp>, SourceError>,
+    pixels: Vec<u8>,
+}
+
+impl AheadFrame {
+    fn light(&self, width: usize) -> Option<Light> {
+        matches!(self.stamp, Ok(Some(_))).then(|| Light::of(&self.pixels, width)).flatten()
+    }
+}
+
+impl<S> Brightened<S>
+where
+    S: DerefMut + Send,
+    S::Target: FrameSource,
+{
+    /// Brightens the frames of `source`.
+    pub fn new(source: S) -> Self {
+        Self { source, brightening: Brightening::default(), ahead: VecDeque::new() }
+    }
+
+    /// Whether another frame must be read before the next one is brightened.
+    fn needs_more(&self) -> bool {
+        let width = self.source.intrinsics().width;
+        let is_dim = |first: &AheadFrame| first.light(width).is_some_and(|light| light.is_dim());
+        !self.brightening.has_begun()
+            && self.ahead.len() < SETTLING_FRAMES
+            && self.ahead.front().is_none_or(is_dim)
+            && self.ahead.back().is_none_or(|last| matches!(last.stamp, Ok(Some(_))))
+    }
+
+    fn read_ahead(&mut self) {
+        let Intrinsics { width, height, .. } = self.source.intrinsics();
+        let mut pixels = vec![0; width * height];
+        let stamp = self.source.next_into(&mut pixels);
+        self.ahead.push_back(AheadFrame { stamp, pixels });
+    }
+
+    /// Brightens a frame and logs a change of the factor.
+    fn brighten(&mut self, pixels: &mut [u8]) {
+        let width = self.source.intrinsics().width;
+        let later = self.ahead.iter().rev().find_map(|frame| frame.light(width));
+        let before = self.brightening.factor();
+        self.brightening.apply(pixels, width, later);
+        match self.brightening.factor() {
+            factor if factor == before => {}
+            1 => tracing::info!("the images are bright enough again"),
+            factor => tracing::warn!(
+                "the images are dim; their grey levels are multiplied by {factor}. Add light or expose longer"
+            ),
+        }
+    }
+}
+
+impl<S> FrameSource for Brightened<S>
+where
+    S: DerefMut + Send,
+    S::Target: FrameSource,
+{
+    fn intrinsics(&self) -> Intrinsics {
+        self.source.intrinsics()
+    }
+
+    fn num_frames(&self) -> Option<usize> {
+        self.source.num_frames()
+    }
+
+    fn keep_prepared_in(&mut self, file: File) -> std::io::Result<()> {
+        self.source.keep_prepared_in(file)
+    }
+
+    fn prepare(
+        &mut self,
+        progress: &mut dyn FnMut(usize, usize) -> bool,
+    ) -> Result<(), SourceError> {
+        self.source.prepare(progress)
+    }
+
+    fn await_frame(&mut self, wake: BorrowedFd<'_>, millis: u32) -> Result<Arrival, SourceError> {
+        let needs_more = self.needs_more();
+        if !needs_more && !self.ahead.is_empty() {
+            return Ok(Arrival::Frame);
+        }
+        let arrival = self.source.await_frame(wake, millis)?;
+        if needs_more && arrival == Arrival::Frame {
+            // One at a time, so that the caller is never kept waiting for several.
+            self.read_ahead();
+            return Ok(if self.needs_more() { Arrival::Nothing } else { Arrival::Frame });
+        }
+        Ok(arrival)
+    }
+
+    fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+        self.check_buffer(pixels)?;
+        while self.needs_more() {
+            self.read_ahead();
+        }
+        let stamp = match self.ahead.pop_front() {
+            Some(frame) => {
+                pixels.copy_from_slice(&frame.pixels);
+                frame.stamp?
+            }
+            None => self.source.next_into(pixels)?,
+        };
+        if stamp.is_some() {
+            self.brighten(pixels);
+        }
+        Ok(stamp)
+    }
+
+    fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
+        self.ahead.clear();
+        self.source.skip_to(sequence)
+    }
+
+    fn losses(&self) -> Option<FrameLosses> {
+        self.source.losses()
+    }
+
+    fn take_notice(&mut self) -> Option<Notice> {
+        self.source.take_notice()
+    }
+
+    fn ground_truth(&self) -> &[StampedPose] {
+        self.source.ground_truth()
+    }
+
+    fn depth_at(&mut self, capture_nanos: i64) -> Result<Option<Image<f32>>, SourceError> {
+        self.source.depth_at(capture_nanos)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::fd::AsFd;
+
+    use super::*;
+    use crate::slam::test_scene::CAMERA;
+
+    /// Frames of one grey level each; `None` is a frame that cannot be read.
+    struct Greys {
+        greys: Vec<Option<u8>>,
+        num_read: usize,
+    }
+
+    impl FrameSource for Greys {
+        fn intrinsics(&self) -> Intrinsics {
+            CAMERA
+        }
+
+        fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+            let Some(grey) = self.greys.get(self.num_read) else { return Ok(None) };
+            let sequence = self.num_read as u64;
+            self.num_read += 1;
+            pixels.fill(grey.unwrap_or_default());
+            match grey {
+                Some(_) => Ok(Some(FrameStamp { sequence, ..FrameStamp::default() })),
+                None => Err(SourceError::Buffer { found: 0, width: 0, height: 0 }),
+            }
+        }
+    }
+
+    fn brightened(greys: impl IntoIterator<Item = Option<u8>>) -> Brightened<Box<Greys>> {
+        Brightened::new(Box::new(Greys { greys: greys.into_iter().collect(), num_read: 0 }))
+    }
+
+    /// Number and grey level of the next frame.
+    fn next(source: &mut Brightened<Box<Greys>>) -> Option<(u64, u8)> {
+        let mut pixels = vec![0; CAMERA.width * CAMERA.height];
+        source.next_into(&mut pixels).unwrap().map(|stamp| (stamp.sequence, pixels[0]))
+    }
+
+    #[test]
+    fn all_frames_of_a_dim_recording_are_brightened_and_none_is_lost() {
+        for num_frames in [1, 3, SETTLING_FRAMES, 10] {
+            let mut source = brightened(vec![Some(30); num_frames]);
+            for sequence in 0..num_frames as u64 {
+                assert_eq!(next(&mut source), Some((sequence, 120)), "{num_frames}");
+            }
+            assert_eq!((next(&mut source), next(&mut source)), (None, None));
+        }
+    }
+
+    #[test]
+    fn frames_of_ordinary_light_are_not_read_ahead() {
+        let mut source = brightened(vec![Some(100); 10]);
+        for sequence in 0..3 {
+            assert_eq!(next(&mut source), Some((sequence, 100)));
+            assert_eq!(source.source.num_read as u64, sequence + 1);
+        }
+    }
+
+    #[test]
+    fn a_camera_whose_exposure_settles_is_not_brightened() {
+        // In steps of three frames from a tenth of the light.
+        let light = [15, 15, 15, 22, 22, 22, 33, 33, 33, 50, 50, 50, 75, 75, 75, 110, 150];
+        let mut source = brightened(light.map(Some));
+        for (sequence, grey) in (0..).zip(light) {
+            assert_eq!(next(&mut source), Some((sequence, grey)));
+        }
+        // One that settles in the dark is, from there on.
+        let light = [10, 10, 10, 15, 15, 15, 30, 30, 30, 30, 30, 30, 30, 30];
+        let mut source = brightened(light.map(Some));
+        for (sequence, grey) in (0..).zip(light) {
+            let seen = if sequence < 6 { grey } else { 4 * grey };
+            assert_eq!(next(&mut source), Some((sequence, seen)));
+        }
+    }
+
+    #[test]
+    fn a_damaged_frame_ends_the_reading_ahead_and_is_reported_in_its_place() {
+        let mut source = brightened([Some(30), Some(30), None, Some(30), Some(30)]);
+        assert_eq!(next(&mut source), Some((0, 120)));
+        assert_eq!(next(&mut source), Some((1, 120)));
+        let mut pixels = vec![0; CAMERA.width * CAMERA.height];
+        assert!(matches!(source.next_into(&mut pixels), Err(SourceError::Buffer { .. })));
+        assert_eq!(next(&mut source), Some((3, 120)));
+    }
+
+    #[test]
+    fn waiting_for_a_dim_camera_reads_one_frame_at_a_time() {
+        let mut source = brightened(vec![Some(30); 10]);
+        let never = File::open("/dev/null").unwrap();
+        for num_read in 1..=SETTLING_FRAMES {
+            let arrival = source.await_frame(never.as_fd(), 0).unwrap();
+            assert_eq!(source.source.num_read, num_read);
+            assert_eq!(arrival == Arrival::Frame, num_read == SETTLING_FRAMES);
+        }
+        for sequence in 0..10 {
+            assert_eq!(source.await_frame(never.as_fd(), 0).unwrap(), Arrival::Frame);
+            assert_eq!(next(&mut source), Some((sequence, 120)));
+        }
     }
 }

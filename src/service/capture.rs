@@ -7,7 +7,7 @@ use crate::capture::opening::{open, rig_remarks};
 use crate::capture::source::{Arrival, FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
 use crate::capture::source_name::SourceName;
-use crate::service::brighten::brighten;
+use crate::service::brighten::Brightened;
 use crate::service::child::{is_supervised, prepared_frames};
 use crate::service::clock::{Pace, duration_from_nanos, now_nanos, realtime_of};
 use crate::service::config::Config;
@@ -20,7 +20,6 @@ use crate::service::run_error::RunError;
 use crate::service::schedule::apply;
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::image::brightening::Brightening;
 use crate::wire::message::{FrameHeader, HealthMessage, PoseMessage, StepMessage};
 use crate::wire::place::{Claim, Place};
 use crate::wire::port::{Access, Hub, Publisher, Subscriber, wait};
@@ -98,8 +97,6 @@ struct Shell<'a> {
     absence: Option<String>,
     /// Images of a recording that could not be used.
     refused: RefusedImages,
-    /// Brightens dim images, where that is configured.
-    brightening: Option<Brightening>,
     /// First sequence of a camera's frames.
     first_sequence: u64,
     /// Frames no newer than the last one of the previous capture are not sent.
@@ -121,7 +118,10 @@ impl<'a> Shell<'a> {
             return Err(SourceError::Camera { name: options.source.to_string(), reason }.into());
         }
         let rig = options.rig.as_deref();
-        let source = open(&options.source, rig, &config.source_params())?;
+        let mut source = open(&options.source, rig, &config.source_params())?;
+        if config.capture.brighten {
+            source = Box::new(Brightened::new(source));
+        }
         for remark in rig_remarks(&options.source, rig) {
             tracing::warn!("{remark}");
         }
@@ -156,7 +156,6 @@ impl<'a> Shell<'a> {
             pace: None,
             absence: None,
             refused: RefusedImages::default(),
-            brightening: config.capture.brighten.then(Brightening::default),
             first_sequence: 0,
             predecessor: Predecessor::default(),
             next_sequence: None,
@@ -318,9 +317,6 @@ impl<'a> Shell<'a> {
             }
             Err(error) => return Err(error.into()),
         };
-        if let Some(brightening) = &mut self.brightening {
-            brighten(brightening, loan.bytes_mut(), self.intrinsics.width);
-        }
         self.refused.accept();
         stamp.sequence = stamp.sequence.saturating_add(self.first_sequence);
         if self.predecessor.is_ahead_of(&stamp) {

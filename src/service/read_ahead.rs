@@ -6,8 +6,6 @@ use crossbeam::channel::{Receiver, Sender, bounded};
 
 use crate::capture::source::{FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
-use crate::service::brighten::brighten;
-use crate::slam::image::brightening::Brightening;
 use crate::slam::image::buffer::Image;
 
 /// Frames that are read before they are requested. One is enough while decoding is faster than mapping; the others
@@ -23,8 +21,6 @@ pub struct ReadingPlan {
     pub with_depth: bool,
     /// Whether reading ends with the first unusable image.
     pub is_strict: bool,
-    /// Whether dim frames are brightened.
-    pub brightens: bool,
 }
 
 /// One frame, or why there is none.
@@ -85,8 +81,6 @@ fn read(
     memory: &Receiver<Vec<u8>>,
     to_taker: &Sender<ReadFrame>,
 ) {
-    let width = source.intrinsics().width;
-    let mut brightening = plan.brightens.then(Brightening::default);
     let mut num_read = 0;
     while num_read < plan.max_frames {
         let Ok(mut pixels) = memory.recv() else { return };
@@ -99,9 +93,6 @@ fn read(
         };
         if let Ok(Some(_)) = stamp {
             num_read += 1;
-            if let Some(brightening) = &mut brightening {
-                brighten(brightening, &mut pixels, width);
-            }
         }
         if to_taker.send(ReadFrame { stamp, pixels, sensor_depth }).is_err() || is_last {
             return;

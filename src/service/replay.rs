@@ -13,6 +13,7 @@ use crate::capture::source::{FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
 use crate::service::adjustments::{Adjustments, Entry};
 use crate::service::alignment_stamps::AlignmentStamps;
+use crate::service::brighten::Brightened;
 use crate::service::config::MapConfig;
 use crate::service::given_pose::{given_pose, truth_in_first_camera};
 use crate::service::map_folder::session::{MapSession, MapSessionError};
@@ -177,10 +178,17 @@ pub fn replay(
         max_frames: config.max_frames.unwrap_or(usize::MAX),
         with_depth: config.initial_depth == DepthOrigin::Sensor,
         is_strict: config.strict,
-        brightens: config.brighten,
     };
     let begin = Instant::now();
     let mut refused = RefusedImages::default();
+    let mut brightened;
+    let source = match config.brighten {
+        true => {
+            brightened = Brightened::new(source);
+            &mut brightened
+        }
+        false => source,
+    };
     let fault = std::thread::scope(|scope| {
         let frames = ReadAhead::start(scope, source, plan).map_err(ReplayError::Thread)?;
         replay.run(&frames, total, &mut refused, observe)

@@ -13,15 +13,75 @@ const LATER_DIM_GREY: u8 = DIM_GREY / 2;
 /// room for light that comes into view. Noise is multiplied too: with 160, ICL office3 with an eighth of its light and a
 /// noise of 8 after the factor does not start from three of four first frames.
 const BRIGHTENED_GREY: u8 = 128;
-/// Grey level below which 90 % of a brightened image stay, so that its light parts are not saturated.
+/// Grey level below which 90 % of a brightened image stay, so that its bright parts are not saturated.
 const BRIGHT_GREY: u8 = 224;
 /// Binary logarithm of the largest factor: beyond 8 grey levels are too coarse to be tracked on.
 const MAX_DOUBLINGS: u8 = 3;
-/// Frames in a row that must be dim before the factor grows: a second or less. A covered lens has passed by then, and a
+/// Frames in a row that must be dim before the factor grows, 0.7 s at 30 Hz. A covered lens has passed by then, and a
 /// passage into the dark has ended.
 const DIM_FRAMES: u8 = 20;
+/// Ratio of the mean grey levels of two images below which the exposure of a camera has settled between them. Cameras
+/// settle within a second or two, by 26 % or more in [`SETTLING_FRAMES`]; a moving camera's images differ less.
+const SETTLED_RATIO: f32 = 1.25;
+/// Frames after which the first images are brightened although their light still changes, 2 s at 30 Hz: it is no
+/// exposure that settles.
+const MAX_UNSETTLED_FRAMES: u8 = 60;
 /// Distance of the pixels that are measured, in columns and rows: some thousand of a VGA image.
 const STEP_PX: usize = 8;
+
+/// Frames whose first and last are compared before dim ones are brightened: a camera changes its exposure every few.
+pub const SETTLING_FRAMES: usize = 6;
+
+/// The light of an image.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Light {
+    /// Grey level below which 90 % of it lie.
+    bright: u8,
+    /// Mean grey level.
+    mean: f32,
+}
+
+impl Light {
+    /// The light of a row-major image with `width` columns; `None` for an image that is too small, or so dark that it
+    /// shows nothing at any factor.
+    pub fn of(pixels: &[u8], width: usize) -> Option<Self> {
+        /// Below this, the largest factor does not reach [`DIM_GREY`].
+        const MIN_USABLE_GREY: u8 = DIM_GREY >> MAX_DOUBLINGS;
+        let mut counts = [0_u32; 256];
+        let rows = pixels.chunks_exact(width.max(1)).skip(STEP_PX / 2).step_by(STEP_PX);
+        for row in rows {
+            for &grey in row.iter().skip(STEP_PX / 2).step_by(STEP_PX) {
+                counts[usize::from(grey)] += 1;
+            }
+        }
+        let measured: u32 = counts.iter().sum();
+        let sum: u32 = (0..).zip(&counts).map(|(grey, count)| grey * count).sum();
+        let mut brighter = measured / 10;
+        let bright = (0..=u8::MAX).rev().find(|&grey| {
+            let count = counts[usize::from(grey)];
+            let is_reached = count > brighter;
+            brighter = brighter.saturating_sub(count);
+            is_reached
+        })?;
+        let mean = sum as f32 / measured as f32;
+        (bright >= MIN_USABLE_GREY).then_some(Self { bright, mean })
+    }
+
+    /// Whether the first images of a stream are dim if one has this light.
+    pub fn is_dim(&self) -> bool {
+        self.bright < DIM_GREY
+    }
+
+    /// The grey level below which 90 % of it lie when it is doubled so often.
+    fn brightened(&self, doublings: u8) -> u32 {
+        u32::from(self.bright) << doublings
+    }
+
+    /// Whether the exposure has settled between this image and a later one.
+    fn is_as_bright_as(&self, later: &Self) -> bool {
+        self.mean.max(later.mean) <= SETTLED_RATIO * self.mean.min(later.mean)
+    }
+}
 
 /// The factor on the grey levels of a stream of frames: 1, 2, 4 or 8. It follows lasting changes of light alone, and
 /// falls at once where the image would become too bright.
@@ -30,6 +90,8 @@ pub struct Brightening {
     doublings: u8,
     /// Dim frames in a row.
     dim_frames: u8,
+    /// First frames that were dim while the exposure settled.
+    unsettled_frames: u8,
     has_begun: bool,
 }
 
@@ -39,10 +101,18 @@ impl Brightening {
         1 << self.doublings
     }
 
-    /// Brightens the next frame, row-major with `width` columns. A frame without any light has no effect on the factor.
-    pub fn apply(&mut self, pixels: &mut [u8], width: usize) {
-        if let Some(bright) = bright_grey(pixels, width) {
-            self.adapt(bright);
+    /// Whether the light of the first frames has set the factor; until then it is 1, and [`Brightening::apply`] looks at
+    /// a later frame.
+    pub fn has_begun(&self) -> bool {
+        self.has_begun
+    }
+
+    /// Brightens the next frame, row-major with `width` columns. `later` is the light of the last of the
+    /// [`SETTLING_FRAMES`] that begin with it: dim first frames are brightened once both are equally bright, since an
+    /// exposure that settles would undo it step by step. A frame without any light has no effect on the factor.
+    pub fn apply(&mut self, pixels: &mut [u8], width: usize, later: Option<Light>) {
+        if let Some(light) = Light::of(pixels, width) {
+            self.adapt(light, later);
         }
         if self.doublings > 0 {
             let (factor, largest) = (self.factor(), u8::MAX >> self.doublings);
@@ -53,48 +123,37 @@ impl Brightening {
         }
     }
 
-    /// Adapts the factor to an image of which 90 % are darker than `bright`.
-    fn adapt(&mut self, bright: u8) {
-        let brightened = |doublings: u8| u32::from(bright) << doublings;
-        while self.doublings > 0 && brightened(self.doublings) > u32::from(BRIGHT_GREY) {
+    /// Adapts the factor to the light of an image.
+    fn adapt(&mut self, light: Light, later: Option<Light>) {
+        if !self.has_begun {
+            let settled = later.is_none_or(|later| light.is_as_bright_as(&later));
+            self.has_begun =
+                !light.is_dim() || settled || self.unsettled_frames >= MAX_UNSETTLED_FRAMES;
+            self.unsettled_frames = self.unsettled_frames.saturating_add(1);
+            if self.has_begun && light.is_dim() {
+                self.raise(light);
+            }
+            return;
+        }
+        while self.doublings > 0 && light.brightened(self.doublings) > u32::from(BRIGHT_GREY) {
             self.doublings -= 1;
         }
-        let limit = if self.has_begun { LATER_DIM_GREY } else { DIM_GREY };
-        let is_dim = brightened(self.doublings) < u32::from(limit);
-        self.dim_frames = if is_dim { self.dim_frames.saturating_add(1) } else { 0 };
-        if is_dim && (!self.has_begun || self.dim_frames >= DIM_FRAMES) {
-            while self.doublings < MAX_DOUBLINGS
-                && brightened(self.doublings + 1) <= u32::from(BRIGHTENED_GREY)
-            {
-                self.doublings += 1;
-            }
+        let is_dim = light.brightened(self.doublings) < u32::from(LATER_DIM_GREY);
+        self.dim_frames = if is_dim { self.dim_frames + 1 } else { 0 };
+        if self.dim_frames >= DIM_FRAMES {
+            self.raise(light);
             self.dim_frames = 0;
         }
-        self.has_begun = true;
     }
-}
 
-/// The grey level below which 90 % of an image lie; `None` for an image that is too small, or so dark that it shows
-/// nothing at any factor.
-fn bright_grey(pixels: &[u8], width: usize) -> Option<u8> {
-    /// Below this, the largest factor does not reach [`DIM_GREY`].
-    const MIN_USABLE_GREY: u8 = DIM_GREY >> MAX_DOUBLINGS;
-    let mut counts = [0_u32; 256];
-    let rows = pixels.chunks_exact(width.max(1)).skip(STEP_PX / 2).step_by(STEP_PX);
-    for row in rows {
-        for &grey in row.iter().skip(STEP_PX / 2).step_by(STEP_PX) {
-            counts[usize::from(grey)] += 1;
+    /// Raises the factor as far as an image allows.
+    fn raise(&mut self, light: Light) {
+        while self.doublings < MAX_DOUBLINGS
+            && light.brightened(self.doublings + 1) <= u32::from(BRIGHTENED_GREY)
+        {
+            self.doublings += 1;
         }
     }
-    let measured: u32 = counts.iter().sum();
-    let mut brighter = measured / 10;
-    let bright = (0..=u8::MAX).rev().find(|&grey| {
-        let count = counts[usize::from(grey)];
-        let is_reached = count > brighter;
-        brighter = brighter.saturating_sub(count);
-        is_reached
-    })?;
-    (bright >= MIN_USABLE_GREY).then_some(bright)
 }
 
 #[cfg(test)]
@@ -110,7 +169,7 @@ mod tests {
 
     fn brightened(brightening: &mut Brightening, image: &[u8]) -> Vec<u8> {
         let mut pixels = image.to_vec();
-        brightening.apply(&mut pixels, WIDTH);
+        brightening.apply(&mut pixels, WIDTH, Light::of(image, WIDTH));
         pixels
     }
 
@@ -190,10 +249,45 @@ mod tests {
     }
 
     #[test]
+    fn an_exposure_that_settles_is_waited_for() {
+        let mut brightening = Brightening::default();
+        let mut settles = |largest, later| {
+            let image = ramp(largest);
+            let mut pixels = image.clone();
+            brightening.apply(&mut pixels, WIDTH, Light::of(&ramp(later), WIDTH));
+            (pixels == image, brightening.has_begun(), brightening.factor())
+        };
+        // Rising and falling.
+        assert_eq!(settles(20, 30), (true, false, 1));
+        assert_eq!(settles(30, 20), (true, false, 1));
+        assert_eq!(settles(28, 30), (false, true, 4));
+        // From the first image in ordinary light on, it follows the rule for later ones.
+        let mut brightening = Brightening::default();
+        brightening.apply(&mut ramp(30), WIDTH, Light::of(&ramp(80), WIDTH));
+        brightening.apply(&mut ramp(80), WIDTH, Light::of(&ramp(200), WIDTH));
+        assert!(brightening.has_begun());
+        let dim = ramp(50);
+        for _ in 0..2 * DIM_FRAMES {
+            assert_eq!(brightened(&mut brightening, &dim), dim);
+        }
+    }
+
+    #[test]
+    fn light_that_never_settles_is_brightened_in_the_end() {
+        let mut brightening = Brightening::default();
+        for _ in 0..MAX_UNSETTLED_FRAMES {
+            brightening.apply(&mut ramp(30), WIDTH, Light::of(&ramp(60), WIDTH));
+            assert_eq!(brightening.factor(), 1);
+        }
+        brightening.apply(&mut ramp(30), WIDTH, Light::of(&ramp(60), WIDTH));
+        assert_eq!(brightening.factor(), 4);
+    }
+
+    #[test]
     fn images_of_any_size_are_accepted() {
         for (len, width) in [(0, 0), (0, 8), (1, 1), (3, 0), (30, 4), (7, 100)] {
             let mut pixels = vec![20; len];
-            Brightening::default().apply(&mut pixels, width);
+            Brightening::default().apply(&mut pixels, width, None);
             assert_eq!(pixels.len(), len);
         }
     }
