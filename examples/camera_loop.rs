@@ -118,13 +118,19 @@ fn feed(source: &str, rate_hz: &str) -> Result<(), Box<dyn Error>> {
     let mut output = std::io::stdout().lock();
     let back = (1..pictures.len().saturating_sub(1)).rev();
     let order: Vec<usize> = (0..pictures.len()).chain(back).collect();
+    /// Pictures that v4l2-ctl collects before it streams; until then the camera shows another picture.
+    const NUM_COLLECTED: usize = 4;
     let mut steps = Steps::default();
+    let mut num_given = 0;
     loop {
         for &index in &order {
             let due = Instant::now() + period;
             output.write_all(&enlarged(&pictures[index].1, width))?;
             output.flush()?;
-            steps.await_picture()?;
+            num_given += 1;
+            if num_given > NUM_COLLECTED {
+                steps.await_picture()?;
+            }
             std::thread::sleep(due.saturating_duration_since(Instant::now()));
         }
     }

@@ -1,5 +1,6 @@
 //! The end of a run, a replay or a recovery: written results, final output, exit code.
 
+use std::collections::BTreeSet;
 use std::error::Error;
 use std::path::Path;
 use std::process::ExitCode;
@@ -10,10 +11,12 @@ use crate::capture::source_name::SourceName;
 use crate::command::print::{note, print, print_as};
 use crate::command::progress::Progress;
 use crate::command::{CommandResult, INTERRUPTED, NOTHING_TRACKED};
-use crate::service::config::Config;
+use crate::service::config::{Config, MapConfig};
 use crate::service::journal::folder::Unfinished;
 use crate::service::journal::log::RunStart;
 use crate::service::journal::{Journal, JournalOptions};
+use crate::service::map_folder::map_folder_error::MapFolderError;
+use crate::service::map_folder::reading::read_manifest;
 use crate::service::results::Results;
 use crate::service::results::calibration::calibration_warning;
 use crate::service::results::mapping_load::mapping_warning;
@@ -23,6 +26,7 @@ use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::has_tracked_set;
 use crate::service::results::summary::Summary;
 use crate::service::results::summary_text::{recovery_text, refused_text, summary_text};
+use crate::slam::counted::counted;
 
 /// Where and how results are written.
 pub struct Ending<'a> {
@@ -88,7 +92,8 @@ impl Ending<'_> {
         if !self.json {
             let (recovery, refused) =
                 (recovery_text(&results.summary), refused_text(&results.summary));
-            print(&format!("{where_to}{recovery}{refused}\n"))?;
+            let map = map_text(&self.config.map).map_or(String::new(), |text| format!("{text}\n"));
+            print(&format!("{map}{where_to}{recovery}{refused}\n"))?;
         }
         self.conclude(&record.ended, &results.summary, &where_to)
     }
@@ -118,7 +123,11 @@ impl Ending<'_> {
             return Ok(());
         }
         let Summary { mode, frames_in, frames_skipped_by_mapper: skipped, .. } = *summary;
-        let calibration = calibration_warning(summary.whitened_residual_median);
+        // Given poses contradict a map without the rig being wrong.
+        let is_tracked = summary.times.track_ms.is_some();
+        let rejections = summary.map_rejections.as_ref().filter(|_| is_tracked);
+        let num_rejections = rejections.map_or(0, Vec::len);
+        let calibration = calibration_warning(summary.whitened_residual_median, num_rejections);
         // If nothing was tracked, the reason is printed later.
         let mapping =
             mapping_warning(mode, skipped, frames_in).filter(|_| summary.untracked.is_none());
@@ -142,6 +151,26 @@ fn closing_text(ended: &EndOfRun, untracked: Option<&str>, place: Option<&str>) 
     Some(match place {
         Some(place) => format!("{how}; {place}"),
         None => how,
+    })
+}
+
+/// What the run left in the folder of its map; `None` where it had none.
+fn map_text(config: &MapConfig) -> Option<String> {
+    if config.folder.is_empty() {
+        return None;
+    }
+    let folder = &config.folder;
+    Some(match read_manifest(Path::new(folder)) {
+        Ok((manifest, _)) => {
+            let keyframes = counted(manifest.keyframes.len(), "keyframe");
+            let epochs: BTreeSet<u32> =
+                manifest.keyframes.iter().map(|listed| listed.keyframe.epoch).collect();
+            let in_epochs = counted(epochs.len(), "epoch");
+            let how = if config.read_only { "unchanged with" } else { "saved with" };
+            format!("map in {folder}, {how} {keyframes} in {in_epochs}")
+        }
+        Err(MapFolderError::Missing(_)) => format!("no map was begun in {folder}"),
+        Err(error) => error.to_string(),
     })
 }
 

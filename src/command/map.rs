@@ -298,7 +298,7 @@ fn merge_maps(arguments: &MergeArguments) -> CommandResult {
         return Err(format!("{folder} is named twice: name two maps").into());
     }
     let (first, second) = (load_all(&arguments.first)?, load_all(&arguments.second)?);
-    let map = merge(&arguments.output, first, second, &arguments.second)?;
+    let map = merge(&arguments.output, [first, second], [&arguments.first, &arguments.second])?;
     print(&format!(
         "{}: {}; the epochs of both maps are kept apart\n",
         arguments.output.display(),

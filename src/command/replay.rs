@@ -55,10 +55,10 @@ pub struct ReplayArgs {
     #[command(flatten)]
     points: MapPointOptions,
     /// Source of a keyframe's initial depth
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, value_enum, default_value_t, value_name = "ORIGIN")]
     initial_depth: DepthOrigin,
     /// Source of the poses
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, value_enum, default_value_t, value_name = "ORIGIN")]
     poses: PoseOrigin,
     /// Write images of every keyframe's inverse depth, variance, density and weights for three motions to DIR/debug
     #[arg(long)]

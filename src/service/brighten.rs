@@ -1,4 +1,4 @@
-//! A source whose dim images are brightened as they are read, which is logged.
+//! A source whose dim images are brightened as they are read. That they are dim is logged in any case.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -16,7 +16,11 @@ use crate::slam::trajectory::StampedPose;
 /// whether the exposure still settles.
 pub(crate) struct Brightened<S> {
     source: S,
+    /// Whether frames are changed; otherwise their light is only measured.
+    is_on: bool,
     brightening: Brightening,
+    /// Largest factor so far.
+    max_factor: u8,
     /// Frames that were read ahead, in order.
     ahead: VecDeque<AheadFrame>,
 }
@@ -38,16 +42,23 @@ where
     S: DerefMut + Send,
     S::Target: FrameSource,
 {
-    /// Brightens the frames of `source`.
-    pub fn new(source: S) -> Self {
-        Self { source, brightening: Brightening::default(), ahead: VecDeque::new() }
+    /// Brightens the frames of `source` if that `is_on`.
+    pub fn new(source: S, is_on: bool) -> Self {
+        let (brightening, ahead) = (Brightening::default(), VecDeque::new());
+        Self { source, is_on, brightening, max_factor: 1, ahead }
+    }
+
+    /// The largest factor by which grey levels were multiplied; `None` where brightening is off.
+    pub fn max_factor(&self) -> Option<u8> {
+        self.is_on.then_some(self.max_factor)
     }
 
     /// Whether another frame must be read before the next one is brightened.
     fn needs_more(&self) -> bool {
         let width = self.source.intrinsics().width;
         let is_dim = |first: &AheadFrame| first.light(width).is_some_and(|light| light.is_dim());
-        !self.brightening.has_begun()
+        self.is_on
+            && !self.brightening.has_begun()
             && self.ahead.len() < SETTLING_FRAMES
             && self.ahead.front().is_none_or(is_dim)
             && self.ahead.back().is_none_or(|last| matches!(last.stamp, Ok(Some(_))))
@@ -65,13 +76,23 @@ where
         let width = self.source.intrinsics().width;
         let later = self.ahead.iter().rev().find_map(|frame| frame.light(width));
         let before = self.brightening.factor();
-        self.brightening.apply(pixels, width, later);
-        match self.brightening.factor() {
-            factor if factor == before => {}
+        self.brightening.follow(pixels, width, later);
+        if self.is_on {
+            self.brightening.apply(pixels);
+        }
+        let factor = self.brightening.factor();
+        self.max_factor = self.max_factor.max(factor);
+        match factor {
+            _ if factor == before => {}
             1 => tracing::info!("the images are bright enough again"),
-            factor => tracing::warn!(
+            _ if self.is_on => tracing::warn!(
                 "the images are dim; their grey levels are multiplied by {factor}. Add light or expose longer"
             ),
+            // Where it is off only the first step is worth a line.
+            _ if before == 1 => tracing::warn!(
+                "the images are dim, and capture.brighten is off: poses may be wrong. Add light or expose longer"
+            ),
+            _ => {}
         }
     }
 }
@@ -185,7 +206,7 @@ mod tests {
     }
 
     fn brightened(greys: impl IntoIterator<Item = Option<u8>>) -> Brightened<Box<Greys>> {
-        Brightened::new(Box::new(Greys { greys: greys.into_iter().collect(), num_read: 0 }))
+        Brightened::new(Box::new(Greys { greys: greys.into_iter().collect(), num_read: 0 }), true)
     }
 
     /// Number and grey level of the next frame.
@@ -202,7 +223,16 @@ mod tests {
                 assert_eq!(next(&mut source), Some((sequence, 120)), "{num_frames}");
             }
             assert_eq!((next(&mut source), next(&mut source)), (None, None));
+            assert_eq!(source.max_factor(), Some(4));
         }
+    }
+
+    #[test]
+    fn brightening_that_is_off_changes_nothing_and_reads_nothing_ahead() {
+        let mut source = brightened(vec![Some(30); 3]);
+        source.is_on = false;
+        assert_eq!(next(&mut source), Some((0, 30)));
+        assert_eq!((source.source.num_read, source.max_factor()), (1, None));
     }
 
     #[test]

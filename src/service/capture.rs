@@ -118,10 +118,8 @@ impl<'a> Shell<'a> {
             return Err(SourceError::Camera { name: options.source.to_string(), reason }.into());
         }
         let rig = options.rig.as_deref();
-        let mut source = open(&options.source, rig, &config.source_params())?;
-        if config.capture.brighten {
-            source = Box::new(Brightened::new(source));
-        }
+        let source = open(&options.source, rig, &config.source_params())?;
+        let source = Box::new(Brightened::new(source, config.capture.brighten));
         for remark in rig_remarks(&options.source, rig) {
             tracing::warn!("{remark}");
         }

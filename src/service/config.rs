@@ -321,7 +321,8 @@ impl Config {
         check_range("supervisor.max_restarts", supervisor.max_restarts, 0..=1000)?;
         // Signs of life arrive once a second: less than two would kill processes that a busy machine delays.
         if supervisor.watchdog_s != 0.0 {
-            check_range("supervisor.watchdog_s", supervisor.watchdog_s, 2.0..=3600.0)?;
+            let checked = check_range("supervisor.watchdog_s", supervisor.watchdog_s, 2.0..=3600.0);
+            checked.map_err(|e| ParameterError { allowed: format!("0 or {}", e.allowed), ..e })?;
         }
         check_range("supervisor.stop_timeout_s", supervisor.stop_timeout_s, seconds.clone())?;
         check_range("supervisor.save_timeout_s", supervisor.save_timeout_s, seconds)?;

@@ -181,16 +181,9 @@ pub fn replay(
     };
     let begin = Instant::now();
     let mut refused = RefusedImages::default();
-    let mut brightened;
-    let source = match config.brighten {
-        true => {
-            brightened = Brightened::new(source);
-            &mut brightened
-        }
-        false => source,
-    };
+    let mut source = Brightened::new(source, config.brighten);
     let fault = std::thread::scope(|scope| {
-        let frames = ReadAhead::start(scope, source, plan).map_err(ReplayError::Thread)?;
+        let frames = ReadAhead::start(scope, &mut source, plan).map_err(ReplayError::Thread)?;
         replay.run(&frames, total, &mut refused, observe)
     })?;
     if let Some(error) = refused.error() {
@@ -198,6 +191,7 @@ pub fn replay(
     }
     let (mut record, saved) = replay.finish(begin)?;
     (record.frames_refused, record.refused) = (refused.count(), refused.text());
+    record.brightened_by = source.max_factor();
     match (fault, saved) {
         (None, Ok(())) => Ok(record),
         (None, Err(cause)) => Err(ReplayError::Unsaved { record: Box::new(record), cause }),

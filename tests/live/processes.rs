@@ -3,16 +3,19 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::{BufRead, BufReader};
+use std::path::Path;
 use std::time::{Duration, UNIX_EPOCH};
 
 use crate::support::{Rig, end, finish, signal, small_camera, until};
 use rustix::process::{Pid, Signal};
+use semidense::capture::image_file::write_gray_png;
 use semidense::capture::opening::open;
 use semidense::capture::source_name::SourceName;
 use semidense::service::config::Config;
 use semidense::service::peers::Peer;
 use semidense::service::replay::{ReplayConfig, replay};
 use semidense::service::results::record::RecordedPose;
+use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::keyframe::DepthPoint;
 use semidense::wire::command::{Command, CommandClient};
 use semidense::wire::conversion::{keyframe_from_messages, pose_from_message};
@@ -110,6 +113,47 @@ fn lockstep_gives_the_same_bits_as_replay_with_any_number_of_threads() {
         let read = |rig: &Rig| fs::read(rig.output().join(file)).unwrap();
         assert!(read(&one) == read(&other), "{file} differs");
     }
+}
+
+/// A recording of the small camera with a fifth of its light.
+fn dim_recording(folder: &Path) {
+    let settings = small_camera(FRAMES).map(|setting| format!("simulator.{setting}"));
+    let config = Config::load(None, &settings).unwrap();
+    let mut source = open(&"sim".parse().unwrap(), None, &config.source_params()).unwrap();
+    let camera = source.intrinsics();
+    let (width, height) = (camera.width, camera.height);
+    fs::create_dir(folder).unwrap();
+    let mut pixels = vec![0; width * height];
+    let mut list = String::new();
+    while let Some(stamp) = source.next_into(&mut pixels).unwrap() {
+        pixels.iter_mut().for_each(|grey| *grey /= 5);
+        let name = format!("{}.png", stamp.sequence);
+        write_gray_png(&folder.join(&name), width, height, &pixels).unwrap();
+        list += &format!("{:.9} {name}\n", stamp.capture_nanos as f64 * 1e-9);
+    }
+    fs::write(folder.join("rgb.txt"), list).unwrap();
+    let Intrinsics { fx, fy, cx, cy, .. } = camera;
+    let text = format!("{fx} {fy} {cx} {cy} {width} {height}\n");
+    fs::write(folder.join("camera.txt"), text).unwrap();
+}
+
+#[test]
+fn dim_frames_are_brightened_alike_by_a_run_and_a_replay() {
+    let rig = Rig::new();
+    let at = |name: &str| rig.folder().join(name).display().to_string();
+    dim_recording(Path::new(&at("dim")));
+    let source = format!("tum:{}", at("dim"));
+    let online = |command: &str, arguments: &[&str]| {
+        let output = at(command);
+        let arguments = [&[command, &source, "--output", &output], arguments].concat();
+        let ended = finish(rig.command(&arguments));
+        assert!(ended.status.success(), "{}", ended.stderr);
+        assert!(ended.stderr.contains("the images are dim"), "{}", ended.stderr);
+        fs::read_to_string(Path::new(&output).join("trajectory_online.txt")).unwrap()
+    };
+    let replayed = online("replay", &[]);
+    assert!(replayed.lines().count() > FRAMES / 2, "{replayed}");
+    assert_eq!(replayed, online("run", &["--lockstep"]));
 }
 
 #[test]

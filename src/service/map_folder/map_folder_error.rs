@@ -59,6 +59,21 @@ pub enum MapFolderError {
         /// The present camera.
         camera: Box<Intrinsics>,
     },
+    /// Two maps of different cameras cannot be merged.
+    #[error(
+        "{first} and {second} are maps of different cameras ({} and {}): only maps of one camera and its calibration can \
+         be merged",
+        camera_text(&cameras[0]),
+        camera_text(&cameras[1])
+    )]
+    Cameras {
+        /// The first map.
+        first: PathBuf,
+        /// The second map.
+        second: PathBuf,
+        /// Their cameras.
+        cameras: Box<[Intrinsics; 2]>,
+    },
     /// Another process is writing it.
     #[error("{folder} is being written by another process{by}: wait for it, or use --read-only")]
     Held {

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use crate::service::map_folder::map_folder_error::{MapFolderError, check_same_camera};
+use crate::service::map_folder::map_folder_error::MapFolderError;
 use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::reading::Loaded;
 use crate::service::map_folder::write_new;
@@ -15,12 +15,17 @@ use crate::slam::map::Map;
 /// Their relative pose stays unknown: the camera is located in either.
 pub fn merge(
     folder: &Path,
-    first: Loaded,
-    second: Loaded,
-    second_folder: &Path,
+    [first, second]: [Loaded; 2],
+    [first_folder, second_folder]: [&Path; 2],
 ) -> Result<Map, MapFolderError> {
     let camera = first.manifest.camera;
-    check_same_camera(second_folder, &second.manifest.camera, &camera)?;
+    if camera != second.manifest.camera {
+        return Err(MapFolderError::Cameras {
+            first: first_folder.to_owned(),
+            second: second_folder.to_owned(),
+            cameras: Box::new([camera, second.manifest.camera]),
+        });
+    }
     let map = joined(first.map, second.map);
     let head = MapHead {
         keyframes: map.keyframes.iter().map(Keyframe::without_depth).collect(),

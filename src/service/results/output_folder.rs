@@ -160,7 +160,10 @@ pub fn prepare_output(folder: &Path) -> Result<(), ResultsError> {
 }
 
 fn write_error(path: &Path, source: io::Error) -> ResultsError {
-    ResultsError::Write { path: path.to_path_buf(), source }
+    match path.is_file() {
+        true => ResultsError::File(path.to_path_buf()),
+        false => ResultsError::Write { path: path.to_path_buf(), source },
+    }
 }
 
 /// Writes a page into an unnamed file, so that nothing of it can remain.

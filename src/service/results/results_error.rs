@@ -16,6 +16,9 @@ pub enum ResultsError {
         /// The system's error.
         source: io::Error,
     },
+    /// The path of the folder is a file.
+    #[error("{0} is a file: name a folder with --output")]
+    File(PathBuf),
     /// There is not enough space.
     #[error(
         "cannot write {path}: {source}; about {needed_mb} MB are needed and {free_mb} MB are free: free some space, or choose another folder with --output"

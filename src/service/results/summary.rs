@@ -222,6 +222,9 @@ pub struct Summary {
     pub frames_refused: u64,
     /// Their number, the first of them, and what is wrong with it; null where there are none.
     pub refused: Option<String>,
+    /// Largest factor on the grey levels of dim images, 1 where none was dim; null where brightening is off. Replay
+    /// only.
+    pub brightened_by: Option<u8>,
     /// Frames by their state.
     #[serde(flatten)]
     pub frames: FrameCounts,
@@ -234,7 +237,7 @@ pub struct Summary {
     /// Each time the map was found to contradict itself: the frame, and why. Replay only.
     pub map_rejections: Option<Vec<RejectionSummary>>,
     /// Median over the tracked frames of residuals over their standard deviation: 1 where everything is as modelled,
-    /// above 1.4 the calibration is doubted; null for fewer than 30 frames.
+    /// above 1.5 the calibration is doubted; null for fewer than 30 frames.
     pub whitened_residual_median: Option<f64>,
     /// From the first frame to the first whose pose is claimed; null where none is.
     pub initialization_secs: Option<f64>,
@@ -349,6 +352,7 @@ impl Summary {
             frames_in: record.frames_in,
             frames_refused: record.frames_refused,
             refused: record.refused.clone(),
+            brightened_by: record.brightened_by,
             frames: FrameCounts::of(&record.poses, &record.map),
             frames_dropped: record.frames_dropped,
             gaps: record.gaps,

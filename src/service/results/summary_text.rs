@@ -16,6 +16,11 @@ pub fn summary_text(summary: &Summary) -> String {
     let mut lines = Lines(String::new());
     lines.add("frames", [frames(summary)]);
     lines.add("images", summary.refused.clone());
+    let brightened = summary.brightened_by.filter(|factor| *factor > 1);
+    lines.add(
+        "images",
+        brightened.map(|by| format!("dim: their grey levels were multiplied by up to {by}")),
+    );
     lines.add("map", [map(summary)]);
     let restarts = summary.restart_causes.iter();
     lines.add("restarts", restarts.map(|of| format!("{} {}: {}", of.count, of.process, of.cause)));
@@ -27,8 +32,8 @@ pub fn summary_text(summary: &Summary) -> String {
     lines.add("online", trajectory_errors(&summary.online));
     // Depth that no frame has confirmed is not judged.
     lines.add("depth", depth_errors(&summary.depth).filter(|_| !is_unproven(summary)));
-    lines.add("track", summary.times.track_ms.as_ref().map(times_text));
-    lines.add("map", summary.times.map_ms.as_ref().map(times_text));
+    lines.add("tracking", summary.times.track_ms.as_ref().map(times_text));
+    lines.add("mapping", summary.times.map_ms.as_ref().map(times_text));
     lines.add("keyframe", summary.times.keyframe_ms.as_ref().map(times_text));
     lines.add("sent after", summary.send_ms.as_ref().map(times_text));
     lines.add("latency", summary.latency.latency_ms.as_ref().map(times_text));
@@ -139,12 +144,16 @@ fn frames(summary: &Summary) -> String {
         (frames, 0 | 1) => format!("{frames} lost"),
         (frames, times) => format!("{frames} lost ({times} times)"),
     };
+    let before = match summary.frames.frames_initializing {
+        0 => String::new(),
+        frames => format!("{frames} before the map, "),
+    };
     let later = match summary.frames.frames_tracked_later {
         0 => String::new(),
         frames => format!(" ({frames} of them afterwards)"),
     };
     format!(
-        "{} in, {} tracked{later}, {lost}, {} dropped, {}{skipped}; {initialised}",
+        "{} in, {before}{} tracked{later}, {lost}, {} dropped, {}{skipped}; {initialised}",
         summary.frames_in,
         summary.frames.frames_tracked,
         summary.frames_dropped,
@@ -253,7 +262,12 @@ mod tests {
             });
         }
         let text = summary_text(&summary(&record));
-        assert!(text.contains(" 60 in, 40 tracked (10 of them afterwards), 10 lost, "), "{text}");
+        assert!(
+            text.contains(
+                " 60 in, 10 before the map, 40 tracked (10 of them afterwards), 10 lost, "
+            ),
+            "{text}"
+        );
     }
 
     #[test]

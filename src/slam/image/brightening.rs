@@ -101,19 +101,23 @@ impl Brightening {
         1 << self.doublings
     }
 
-    /// Whether the light of the first frames has set the factor; until then it is 1, and [`Brightening::apply`] looks at
-    /// a later frame.
+    /// Whether the light of the first frames has set the factor; until then it is 1, and [`Brightening::follow`] looks
+    /// at a later frame.
     pub fn has_begun(&self) -> bool {
         self.has_begun
     }
 
-    /// Brightens the next frame, row-major with `width` columns. `later` is the light of the last of the
+    /// Sets the factor for the next frame, row-major with `width` columns. `later` is the light of the last of the
     /// [`SETTLING_FRAMES`] that begin with it: dim first frames are brightened once both are equally bright, since an
     /// exposure that settles would undo it step by step. A frame without any light has no effect on the factor.
-    pub fn apply(&mut self, pixels: &mut [u8], width: usize, later: Option<Light>) {
+    pub fn follow(&mut self, pixels: &[u8], width: usize, later: Option<Light>) {
         if let Some(light) = Light::of(pixels, width) {
             self.adapt(light, later);
         }
+    }
+
+    /// Brightens the frame.
+    pub fn apply(&self, pixels: &mut [u8]) {
         if self.doublings > 0 {
             let (factor, largest) = (self.factor(), u8::MAX >> self.doublings);
             for pixel in pixels {
@@ -169,7 +173,8 @@ mod tests {
 
     fn brightened(brightening: &mut Brightening, image: &[u8]) -> Vec<u8> {
         let mut pixels = image.to_vec();
-        brightening.apply(&mut pixels, WIDTH, Light::of(image, WIDTH));
+        brightening.follow(image, WIDTH, Light::of(image, WIDTH));
+        brightening.apply(&mut pixels);
         pixels
     }
 
@@ -254,7 +259,8 @@ mod tests {
         let mut settles = |largest, later| {
             let image = ramp(largest);
             let mut pixels = image.clone();
-            brightening.apply(&mut pixels, WIDTH, Light::of(&ramp(later), WIDTH));
+            brightening.follow(&image, WIDTH, Light::of(&ramp(later), WIDTH));
+            brightening.apply(&mut pixels);
             (pixels == image, brightening.has_begun(), brightening.factor())
         };
         // Rising and falling.
@@ -263,8 +269,8 @@ mod tests {
         assert_eq!(settles(28, 30), (false, true, 4));
         // From the first image in ordinary light on, it follows the rule for later ones.
         let mut brightening = Brightening::default();
-        brightening.apply(&mut ramp(30), WIDTH, Light::of(&ramp(80), WIDTH));
-        brightening.apply(&mut ramp(80), WIDTH, Light::of(&ramp(200), WIDTH));
+        brightening.follow(&ramp(30), WIDTH, Light::of(&ramp(80), WIDTH));
+        brightening.follow(&ramp(80), WIDTH, Light::of(&ramp(200), WIDTH));
         assert!(brightening.has_begun());
         let dim = ramp(50);
         for _ in 0..2 * DIM_FRAMES {
@@ -276,10 +282,10 @@ mod tests {
     fn light_that_never_settles_is_brightened_in_the_end() {
         let mut brightening = Brightening::default();
         for _ in 0..MAX_UNSETTLED_FRAMES {
-            brightening.apply(&mut ramp(30), WIDTH, Light::of(&ramp(60), WIDTH));
+            brightening.follow(&ramp(30), WIDTH, Light::of(&ramp(60), WIDTH));
             assert_eq!(brightening.factor(), 1);
         }
-        brightening.apply(&mut ramp(30), WIDTH, Light::of(&ramp(60), WIDTH));
+        brightening.follow(&ramp(30), WIDTH, Light::of(&ramp(60), WIDTH));
         assert_eq!(brightening.factor(), 4);
     }
 
@@ -287,7 +293,9 @@ mod tests {
     fn images_of_any_size_are_accepted() {
         for (len, width) in [(0, 0), (0, 8), (1, 1), (3, 0), (30, 4), (7, 100)] {
             let mut pixels = vec![20; len];
-            Brightening::default().apply(&mut pixels, width, None);
+            let mut brightening = Brightening::default();
+            brightening.follow(&pixels, width, None);
+            brightening.apply(&mut pixels);
             assert_eq!(pixels.len(), len);
         }
     }

@@ -129,6 +129,7 @@ pub(super) const RUN_WORDS: &[Words] = words! {
     frames_in: Run, Format::Count, "Frames", "Frames that the source delivered.";
     frames_refused: Run, Format::Count, "Images refused", "Images of the source that could not be used. 0 is good.";
     refused: Run, Format::Text, "What was refused", "The first image that could not be used, and what is wrong with it.";
+    brightened_by: Run, Format::Count, "Brightened by", "Largest factor on the grey levels of dim images. 1 is good: more light, or a longer exposure, has less noise.";
     gaps: Run, Format::Count, "Gaps", "Holes in the source's numbering of frames. 0 is good.";
     restarts: Run, Format::Count, "Restarts", "Processes that were restarted after they had ended. 0 is good.";
     restarts_by_process: Run, Format::Counts, "Restarts of each process", "How often each process was restarted.";
@@ -148,7 +149,7 @@ pub(super) const RUN_WORDS: &[Words] = words! {
     deadline_misses: Tracking, Format::Count, "Deadline misses", "Frames published later than the tracker's deadline. 0 is good.";
     initialization_secs: Tracking, Format::Unit("s"), "Time to the first pose", "From the first frame to the first whose pose is claimed.";
     untracked: Tracking, Format::Text, "Why nothing was tracked", "The most likely reason.";
-    whitened_residual_median: Tracking, Format::Number, "Residual over its standard deviation", "Median over the tracked frames: 1 is as modelled; above 1.4 the calibration is doubtful.";
+    whitened_residual_median: Tracking, Format::Number, "Residual over its standard deviation", "Median over the tracked frames: 1 is as modelled; above 1.5 the calibration is doubtful.";
 
     keyframes: Map, Format::Count, "Keyframes", "Frames of the final map that have their own depth.";
     keyframes_without_depth: Map, Format::Count, "Keyframes without depth", "Those whose depth is no longer held: the oldest of a long run.";
