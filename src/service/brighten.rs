@@ -265,6 +265,7 @@ mod tests {
     fn a_damaged_frame_ends_the_reading_ahead_and_is_reported_in_its_place() {
         let mut source = brightened([Some(30), Some(30), None, Some(30), Some(30)]);
         assert_eq!(next(&mut source), Some((0, 120)));
+        assert_eq!(source.source.num_read, 3);
         assert_eq!(next(&mut source), Some((1, 120)));
         let mut pixels = vec![0; CAMERA.width * CAMERA.height];
         assert!(matches!(source.next_into(&mut pixels), Err(SourceError::Buffer { .. })));
