@@ -154,7 +154,7 @@ fn closing_text(ended: &EndOfRun, untracked: Option<&str>, place: Option<&str>) 
     })
 }
 
-/// What the run left in the folder of its map; `None` where it had none.
+/// What the folder of the run's map holds now; `None` where the run had none.
 fn map_text(config: &MapConfig) -> Option<String> {
     if config.folder.is_empty() {
         return None;
@@ -166,8 +166,8 @@ fn map_text(config: &MapConfig) -> Option<String> {
             let epochs: BTreeSet<u32> =
                 manifest.keyframes.iter().map(|listed| listed.keyframe.epoch).collect();
             let in_epochs = counted(epochs.len(), "epoch");
-            let how = if config.read_only { "unchanged with" } else { "saved with" };
-            format!("map in {folder}, {how} {keyframes} in {in_epochs}")
+            let unchanged = if config.read_only { ", unchanged" } else { "" };
+            format!("map in {folder}: {keyframes} in {in_epochs}{unchanged}")
         }
         Err(MapFolderError::Missing(_)) => format!("no map was begun in {folder}"),
         Err(error) => error.to_string(),

@@ -149,11 +149,31 @@ fn dim_frames_are_brightened_alike_by_a_run_and_a_replay() {
         let ended = finish(rig.command(&arguments));
         assert!(ended.status.success(), "{}", ended.stderr);
         assert!(ended.stderr.contains("the images are dim"), "{}", ended.stderr);
+        let is_told =
+            ended.stdout.contains("images      dim: their grey levels were multiplied by");
+        assert_eq!(is_told, command == "replay", "{}", ended.stdout);
         fs::read_to_string(Path::new(&output).join("trajectory_online.txt")).unwrap()
     };
     let replayed = online("replay", &[]);
     assert!(replayed.lines().count() > FRAMES / 2, "{replayed}");
     assert_eq!(replayed, online("run", &["--lockstep"]));
+}
+
+#[test]
+fn the_last_lines_say_what_the_map_folder_holds() {
+    let rig = Rig::new();
+    let map = rig.folder().join("map").display().to_string();
+    for (more, end) in [(None, "in 1 epoch"), (Some("--read-only"), "in 1 epoch, unchanged")] {
+        let mut command = rig.command(&["replay", "sim", "--map", &map]);
+        command.arg("--output").arg(rig.output()).args(more);
+        for setting in small_camera(FRAMES) {
+            command.args(["--set", &format!("simulator.{setting}")]);
+        }
+        let ended = finish(command);
+        let told = ended.stdout.lines().find(|line| line.starts_with("map in "));
+        let told = told.unwrap_or_else(|| panic!("{} {}", ended.stdout, ended.stderr));
+        assert!(told.starts_with(&format!("map in {map}: ")) && told.ends_with(end), "{told}");
+    }
 }
 
 #[test]
