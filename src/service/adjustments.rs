@@ -75,6 +75,8 @@ struct InFlight {
     epoch: u32,
     map_revision: u64,
     newest: Option<u64>,
+    /// Whether it began after the last frame.
+    is_last: bool,
     /// Whether the mapper it was taken from has been replaced.
     is_orphan: bool,
 }
@@ -88,6 +90,8 @@ pub struct Adjustments {
     /// Frames so far, and the sequence of the last.
     frames: u64,
     sequence: u64,
+    /// Whether no frame follows.
+    is_over: bool,
     records: Vec<AdjustmentRecord>,
     searches: Vec<SearchRecord>,
     failure: Option<String>,
@@ -107,6 +111,7 @@ impl Adjustments {
             in_flight: None,
             frames: 0,
             sequence: 0,
+            is_over: false,
             records: Vec::new(),
             searches: Vec::new(),
             failure: None,
@@ -165,13 +170,16 @@ impl Adjustments {
         let deadline = is_live.then(|| Instant::now() + LAST_ADJUSTMENTS);
         let left =
             || deadline.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
-        let mut outcome = self.apply_within(mapper, left());
+        let (_, mut outcome) = self.take_in(mapper, left());
+        self.is_over = true;
         while !left().is_zero() {
             self.begin_with(mapper, Mapper::begin_last_search);
-            if self.in_flight.is_none() {
+            let (fate, closed) = self.take_in(mapper, left());
+            outcome = merged_outcome(outcome, closed);
+            // One that cannot enter would be solved again and again.
+            if fate.is_none_or(|fate| fate == Fate::Dropped) {
                 break;
             }
-            outcome = merged_outcome(outcome, self.apply_within(mapper, left()));
         }
         self.begin_with(mapper, Mapper::begin_last_adjustment);
         outcome = merged_outcome(outcome, self.apply_within(mapper, left()));
@@ -206,6 +214,7 @@ impl Adjustments {
             epoch: mapper.keyframe().map_or(0, |keyframe| keyframe.epoch),
             map_revision: mapper.map().revision,
             newest: newest(mapper),
+            is_last: self.is_over,
             is_orphan: false,
         });
         thread.hand_over(window);
@@ -227,15 +236,20 @@ impl Adjustments {
 
     /// Lets in the estimate in flight if it comes back within `timeout`.
     fn apply_within(&mut self, mapper: &mut Mapper, timeout: Duration) -> StepOutcome {
+        self.take_in(mapper, timeout).1
+    }
+
+    /// Lets in the estimate in flight if it comes back within `timeout`; its fate is `None` if it did not.
+    fn take_in(&mut self, mapper: &mut Mapper, timeout: Duration) -> (Option<Fate>, StepOutcome) {
         let (Some(in_flight), Some(thread)) = (self.in_flight, &self.thread) else {
-            return StepOutcome::default();
+            return Default::default();
         };
         let mut finished = match thread.wait_at_most(timeout) {
             Ok(finished) => finished,
-            Err(RecvTimeoutError::Timeout) => return StepOutcome::default(),
+            Err(RecvTimeoutError::Timeout) => return Default::default(),
             Err(RecvTimeoutError::Disconnected) => {
                 self.give_up();
-                return StepOutcome::default();
+                return Default::default();
             }
         };
         self.in_flight = None;
@@ -249,14 +263,15 @@ impl Adjustments {
             let (sequence, nanos) = (self.sequence, finished.nanos);
             self.records.push(AdjustmentRecord { sequence, frames, nanos, fate, adjustment });
         }
-        match fate {
+        let outcome = match fate {
             _ if in_flight.is_orphan => StepOutcome::default(),
             Fate::Dropped => {
                 mapper.drop_adjustment(finished.window);
                 StepOutcome::default()
             }
             Fate::Entered | Fate::Merged => mapper.end_adjustment(finished.window),
-        }
+        };
+        (Some(fate), outcome)
     }
 
     /// The thread has panicked: keyframes are no longer estimated jointly.
@@ -279,7 +294,8 @@ fn newest(mapper: &Mapper) -> Option<u64> {
 fn fate(mapper: &Mapper, in_flight: &InFlight) -> Fate {
     let is_same_map = mapper.keyframe().is_some_and(|active| {
         active.epoch == in_flight.epoch
-            && active.map_state == MapState::Established
+            // After the last frame its keyframes are estimated whatever became of the active one.
+            && (in_flight.is_last || active.map_state == MapState::Established)
             // Otherwise another correction has moved its keyframes.
             && mapper.map().revision == in_flight.map_revision
     });
@@ -304,4 +320,4 @@ mod pass_tests;
 #[cfg(test)]
 mod refinement_tests;
 #[cfg(test)]
-mod tests;
+pub(in crate::service) mod tests;

@@ -127,11 +127,14 @@ impl Odometry {
         self.end_estimate();
         while let Some(window) = self.mapper.begin_last_search() {
             self.estimate(window);
-            self.end_estimate();
+            // One that cannot enter would be solved again and again.
+            if !self.end_last_estimate() {
+                break;
+            }
         }
         if let Some(window) = self.mapper.begin_last_adjustment() {
             self.estimate(window);
-            self.end_estimate();
+            self.end_last_estimate();
         }
         while self.mapper.refine_depth() {}
         self.mapper.store_confirmed_points();
@@ -177,19 +180,33 @@ impl Odometry {
         }
     }
 
-    /// Applies the estimate, unless the map it was made from has changed.
+    /// Applies the estimate, unless the map it was made from has changed or is rejected.
     fn end_estimate(&mut self) -> StepOutcome {
         let Some(estimate) = self.estimate.take() else { return StepOutcome::default() };
-        let is_same_map = self.mapper.keyframe().is_some_and(|active| {
-            active.epoch == estimate.epoch
-                && active.map_state == MapState::Established
-                && self.mapper.map().revision == estimate.map_revision
-        });
-        if is_same_map {
+        let is_established =
+            self.mapper.keyframe().is_some_and(|active| active.map_state == MapState::Established);
+        if is_established && self.is_of_this_map(&estimate) {
             return self.mapper.end_adjustment(estimate.window);
         }
         self.mapper.drop_adjustment(estimate.window);
         StepOutcome::default()
+    }
+
+    /// Applies an estimate made after the last frame, whatever became of the active keyframe; false if it was dropped.
+    fn end_last_estimate(&mut self) -> bool {
+        let Some(estimate) = self.estimate.take() else { return false };
+        let is_applied = self.is_of_this_map(&estimate);
+        if is_applied {
+            self.mapper.end_adjustment(estimate.window);
+        } else {
+            self.mapper.drop_adjustment(estimate.window);
+        }
+        is_applied
+    }
+
+    fn is_of_this_map(&self, estimate: &Estimate) -> bool {
+        self.mapper.map().revision == estimate.map_revision
+            && self.mapper.keyframe().is_some_and(|active| active.epoch == estimate.epoch)
     }
 
     /// Hands the mapper's keyframe to the tracker, in the memory of the previous one.

@@ -3,6 +3,8 @@
 use super::tests::{Walk, start, until};
 use super::*;
 use crate::slam::mapper::MapperParams;
+use crate::slam::mapper::consistency::ConsistencyParams;
+use crate::slam::mapper::situation::Situation;
 use crate::slam::window::params::WindowParams;
 
 /// Two free keyframes: the third before the newest has settled.
@@ -64,4 +66,28 @@ fn depth_that_was_dropped_is_refined_later() {
     again.optimise();
     live.mapper.end_adjustment(again);
     assert_eq!(refined(&live), [1], "the newest that has settled in the estimate before");
+}
+
+#[test]
+fn keyframes_of_a_map_that_ends_rejected_are_estimated_and_refined_nevertheless() {
+    let mut adjustments = start(Entry::AfterFrames(1), Box::new(Window::optimise));
+    let consistency = ConsistencyParams { max_failed_ratio: 0.3, ..Default::default() };
+    let mut walk = Walk::with(MapperParams { consistency, ..MapperParams::default() });
+    for _ in 0..18 {
+        walk.go(&mut adjustments);
+    }
+    walk.replace_scene(9);
+    for _ in 0..100 {
+        walk.go(&mut adjustments);
+        if matches!(walk.mapper.situation(), Situation::Rejected(_)) {
+            break;
+        }
+    }
+    assert!(matches!(walk.mapper.situation(), Situation::Rejected(_)));
+    drop(adjustments.take_records());
+    adjustments.finish(&mut walk.mapper);
+    let last = adjustments.take_records().last().unwrap();
+    assert_eq!(last.fate, Fate::Entered);
+    let refined = walk.mapper.map().keyframes.iter().filter(|keyframe| keyframe.is_refined);
+    assert!(refined.count() >= 3);
 }

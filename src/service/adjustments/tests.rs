@@ -13,27 +13,28 @@ use crate::slam::pose::{PoseEstimate, TrackingState};
 use crate::slam::test_scene::{CAMERA, Scene};
 
 /// Frames between two keyframes.
-pub(super) const KEYFRAME_INTERVAL: u64 = 4;
+pub(in crate::service) const KEYFRAME_INTERVAL: u64 = 4;
 
 /// A camera moving sideways, with exact poses, depth for its first keyframe, and a keyframe every fourth frame.
-pub(super) struct Walk {
+pub(in crate::service) struct Walk {
     scene: Scene,
-    pub(super) mapper: Mapper,
+    pub(in crate::service) mapper: Mapper,
+    keeps_keyframe: bool,
     pub(super) frames: u64,
 }
 
 impl Walk {
-    fn new() -> Self {
+    pub(in crate::service) fn new() -> Self {
         Self::with(MapperParams::default())
     }
 
     pub(super) fn with(params: MapperParams) -> Self {
         let mapper = Mapper::new(CAMERA, params).unwrap();
-        Self { scene: Scene::new(3), mapper, frames: 0 }
+        Self { scene: Scene::new(3), mapper, keeps_keyframe: false, frames: 0 }
     }
 
     /// Maps the next frame, without the joint estimation that follows it.
-    fn step(&mut self) -> StepOutcome {
+    pub(in crate::service) fn step(&mut self) -> StepOutcome {
         let k = self.frames;
         self.frames += 1;
         let x = 0.06 * k as f64;
@@ -51,12 +52,17 @@ impl Walk {
             keyframe_from_camera: active.map_or(SE3::identity(), |k| {
                 k.world_from_keyframe.inverse_transform_pose(&world_from_camera)
             }),
-            proposes_keyframe: k > 0 && k.is_multiple_of(KEYFRAME_INTERVAL),
+            proposes_keyframe: !self.keeps_keyframe && k > 0 && k.is_multiple_of(KEYFRAME_INTERVAL),
             ..PoseEstimate::unknown(&frame)
         };
         let outcome = self.mapper.step(&frame, &pose, (k == 0).then_some(&depth), &mut || {});
         self.mapper.finish_keyframe();
         outcome
+    }
+
+    /// From now on the camera sees another scene, whatever its poses say, and stays on its keyframe.
+    pub(super) fn replace_scene(&mut self, seed: u64) {
+        (self.scene, self.keeps_keyframe) = (Scene::new(seed), true);
     }
 
     /// Maps the next frame; returns the outcome of the joint estimation.
@@ -86,7 +92,7 @@ impl Walk {
     }
 }
 
-pub(super) fn start(entry: Entry, optimise: Optimise) -> Adjustments {
+pub(in crate::service) fn start(entry: Entry, optimise: Optimise) -> Adjustments {
     Adjustments::start_with(entry, Background::Other, optimise).unwrap()
 }
 
