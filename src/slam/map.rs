@@ -221,9 +221,14 @@ impl Map {
         self.keyframes.iter().filter(|keyframe| !keyframe.image.is_empty()).count()
     }
 
-    /// Index of a keyframe in the list, searched from the end: the newest are queried most.
+    /// Index of a keyframe in the list. Ids ascend in a mapper's map; one of another order is searched from the end.
     pub fn index_of(&self, keyframe_id: u64) -> Option<usize> {
-        self.keyframes.iter().rposition(|keyframe| keyframe.keyframe_id == keyframe_id)
+        let is_it = |keyframe: &Keyframe| keyframe.keyframe_id == keyframe_id;
+        let place = self.keyframes.partition_point(|keyframe| keyframe.keyframe_id < keyframe_id);
+        match self.keyframes.get(place).is_some_and(is_it) {
+            true => Some(place),
+            false => self.keyframes.iter().rposition(is_it),
+        }
     }
 
     /// `map_from_camera` of a frame whose pose relative to a keyframe is given.
@@ -346,6 +351,12 @@ impl Keyframe {
     /// Whether it has image and depth: the oldest of a large map keep only their poses.
     pub fn has_depth(&self) -> bool {
         !self.image.is_empty() && !self.points.is_empty()
+    }
+
+    /// Whether both were made from the same frame. Their epochs may differ: one may have been joined to another since.
+    pub fn is_same(&self, other: &Self) -> bool {
+        let made = |of: &Self| (of.keyframe_id, of.sequence, of.capture_nanos, of.intrinsics);
+        made(self) == made(other)
     }
 
     /// Whether it can be compared with others: it has image and depth, and its map is established.

@@ -77,3 +77,14 @@ fn the_covariance_of_a_pose_moves_with_it_unless_a_correction_gives_one() {
     let said = KeyframePoseCovariance::bounded(&(matrix * 0.5));
     assert_eq!(corrected(Some(said), None), said);
 }
+
+#[test]
+fn a_keyframe_is_found_in_any_order() {
+    for ids in [vec![0, 3, 4, 90], vec![90, 4, 0, 3]] {
+        let map = Map { keyframes: ids.iter().copied().map(keyframe).collect(), ..Map::default() };
+        for (index, id) in ids.iter().enumerate() {
+            assert_eq!(map.index_of(*id), Some(index));
+        }
+        assert_eq!(map.index_of(5), None);
+    }
+}

@@ -51,8 +51,10 @@ impl Thinning {
         // They follow nothing else: two leaders would move them twice.
         extended.keyframes.retain(|k| !self.attached.contains_key(&k.keyframe_id));
         extended.keyframes.extend(self.attached.iter().filter_map(|(&id, to)| {
+            // Most leaders stay, and looking up a keyframe costs more.
+            let place = *places.get(to)?;
             let (was, keyframe) = (map.get(*to)?, map.get(id)?);
-            let by = *places.get(to)? * was.map_from_keyframe.inverse();
+            let by = place * was.map_from_keyframe.inverse();
             Some(KeyframeCorrection::of_pose(id, by * keyframe.map_from_keyframe))
         }));
         extended
