@@ -2,9 +2,11 @@
 
 mod commands;
 mod output;
-mod switched_map;
+mod used_map;
 
+use std::panic::resume_unwind;
 use std::rc::Rc;
+use std::thread;
 use std::time::Duration;
 
 use crate::service::adjustments::{Adjustments, Entry};
@@ -16,7 +18,7 @@ use crate::service::frame_order::{FrameOrder, FrameOrderOutcome, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::map_folder::session::{MapSession, MapSessionError};
 use crate::service::mapper::output::Output;
-use crate::service::mapper::switched_map::SwitchedMap;
+use crate::service::mapper::used_map::UsedMap;
 use crate::service::mode::Mode;
 use crate::service::pairing::Pairing;
 use crate::service::run_error::RunError;
@@ -36,6 +38,8 @@ use crate::wire::topic::{FRAME, MAPPER_HEALTH, POSE};
 
 /// Longest sleep between two checks of signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
+/// Pause between two signs of life while a map is read.
+const LOADING_PAUSE: Duration = Duration::from_millis(20);
 /// Cause that a mapper reports before it writes its map, which may take long.
 pub const WRITES_MAP: &str = "the map is being written";
 
@@ -51,10 +55,11 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), RunEr
     shell.health.notify_ready();
     let outcome = shell.map_until(shutdown);
     let outcome = outcome.and_then(|()| shell.save_map_folder());
-    // A supervisor that did not request the end starts another mapper, which continues from the checkpoint.
-    if outcome.is_ok() && !is_supervised() {
+    // A supervisor that did not request the end starts another mapper, which continues from the checkpoint. So does a
+    // mapper that is restarted alone: the tracker still holds this map's numbers.
+    if outcome.is_ok() && !is_supervised() && !shell.place.is_running("tracker") {
         shell.kept.iter_mut().for_each(|kept| kept.remove_on_drop());
-        SwitchedMap::forget(&shell.place.loaded_map_path());
+        UsedMap::forget(&shell.place.loaded_map_path());
     }
     shell.health.end(&outcome, "stopped");
     outcome
@@ -82,6 +87,8 @@ struct Shell<'a> {
     kept: Option<Kept>,
     /// The checkpoint of a mapper that died, until the first frame.
     left: Option<Map>,
+    /// The map on disk, as it is named to a successor.
+    used: UsedMap,
     /// The map on disk.
     map: Option<MapSession>,
     /// The last claimed pose.
@@ -97,10 +104,10 @@ impl<'a> Shell<'a> {
         let place = Place::new(&config.instance, &config.root)?;
         let claim = place.claim("mapper")?;
         let hub = Hub::join(&place, "mapper", Access::Member)?;
-        let (kept, left) = match mode {
+        let (kept, left, used) = match mode {
             // A lockstep run ends with any of its processes.
-            Mode::Lockstep => (None, None),
-            Mode::Live => Kept::open(&place.checkpoint_path()),
+            Mode::Lockstep => (None, None, UsedMap::of(&config.map)),
+            Mode::Live => used_map::open_checkpoint(&place, &config.map),
         };
         let threads = config.mapper.threads;
         let pool = rayon::ThreadPoolBuilder::new()
@@ -125,6 +132,7 @@ impl<'a> Shell<'a> {
             adjustments: start_adjustments(config, mode)?,
             kept,
             left,
+            used,
             map: None,
             last_pose: None,
             pool,
@@ -136,21 +144,32 @@ impl<'a> Shell<'a> {
         Ok(shell)
     }
 
-    /// Reads the map on disk, if one is named.
+    /// Reads the map on disk, if one is named, while signs of life continue.
     fn load_map(&mut self) -> Result<(), RunError> {
-        let (configured, max_bytes) = (&self.config.map, self.config.mapping.max_map_bytes());
-        let path = self.place.loaded_map_path();
-        let switched = self.kept.as_ref().and_then(|_| SwitchedMap::read(&path, configured));
-        let map = switched.as_ref().map_or(configured, |over| &over.to);
-        let numbering = switched.as_ref().map_or_else(Default::default, |over| over.numbering);
-        let waits = self.mode == Mode::Lockstep;
-        if !map.folder.is_empty() {
-            let cause = format!("loading the map {}", map.folder);
-            self.health.enter(ProcessState::Preparing, &cause);
+        let map = self.used.switched_to.as_ref().unwrap_or(&self.config.map).clone();
+        if map.folder.is_empty() {
+            return Ok(());
         }
-        let session = self.pool.install(|| MapSession::open(map, max_bytes, numbering, waits));
+        self.health.enter(ProcessState::Preparing, &format!("loading the map {}", map.folder));
+        let (max_bytes, numbering) = (self.config.mapping.max_map_bytes(), self.used.numbering);
+        let waits = self.mode == Mode::Lockstep;
+        let open = || MapSession::open(&map, max_bytes, numbering, waits);
+        let session = self.report_while(open).unwrap_or_else(|panic| resume_unwind(panic));
         self.map = session.map_err(MapSessionError::from)?;
         Ok(())
+    }
+
+    /// Does something slow in the pool while signs of life continue; an error is its panic.
+    fn report_while<T: Send>(&mut self, slow: impl FnOnce() -> T + Send) -> thread::Result<T> {
+        let (health, pool) = (&mut self.health, &self.pool);
+        thread::scope(|scope| {
+            let running = scope.spawn(|| pool.install(slow));
+            while !running.is_finished() {
+                health.report();
+                thread::sleep(LOADING_PAUSE);
+            }
+            running.join()
+        })
     }
 
     /// Writes what the map on disk lacks.

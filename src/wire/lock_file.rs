@@ -96,6 +96,13 @@ pub(in crate::wire) fn lock_until(file: &File, operation: FlockOperation, end: I
     }
 }
 
+/// Whether a process holds a lock. One that cannot be opened counts as held.
+pub(in crate::wire) fn is_held(path: &Path) -> bool {
+    File::open(path).map_or(true, |file| {
+        rustix::fs::flock(&file, FlockOperation::NonBlockingLockShared).is_err()
+    })
+}
+
 pub(in crate::wire) fn open_lock(path: &Path, mode: u32) -> io::Result<File> {
     let mut options = File::options();
     options.read(true).write(true).create(true).truncate(false).mode(mode).open(path)

@@ -12,7 +12,7 @@ use rustix::fs::FlockOperation;
 
 use crate::wire::folders::{MAX_ROOT_BYTES, SHARED_MEMORY, SYSTEM_ROOT};
 use crate::wire::limits::raise_open_files;
-use crate::wire::lock_file::{LockFile, Locking, USER_ALONE, lock_named};
+use crate::wire::lock_file::{LockFile, Locking, USER_ALONE, is_held, lock_named};
 use crate::wire::place_error::PlaceError;
 use crate::wire::root_folder::{is_mine, usual_root};
 
@@ -189,6 +189,12 @@ impl Place {
         let end = Instant::now() + LONGEST_HOLD;
         let lock = lock_named(&path, FlockOperation::NonBlockingLockShared, end).map_err(io)?;
         lock.ok_or(PlaceError::Held(path))
+    }
+
+    /// Whether `process` of this instance runs.
+    pub fn is_running(&self, process: &str) -> bool {
+        let path = self.claim_path_of(&self.instance, process);
+        path.exists() && is_held(&path)
     }
 
     /// Process id of a running member of the instance, from its claim.

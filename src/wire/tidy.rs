@@ -2,7 +2,7 @@
 //! them.
 
 use std::collections::BTreeSet;
-use std::fs::{self, File};
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -10,7 +10,7 @@ use iceoryx2::node::NodeState;
 use iceoryx2::prelude::*;
 use rustix::fs::FlockOperation;
 
-use crate::wire::lock_file::lock_named;
+use crate::wire::lock_file::{is_held, lock_named};
 use crate::wire::place::{
     CHECKPOINT_SUFFIX, CLAIM_SUFFIX, JOIN_LOCK, LOADED_MAP_SUFFIX, MEMBERS, POSITION_SUFFIX, Place,
 };
@@ -35,6 +35,7 @@ impl Place {
         // What cannot be removed is left to the next process.
         self.remove_dead_nodes();
         self.remove_failed_nodes();
+        self.remove_left_files();
         if !self.has_nodes() {
             self.node_counters().for_each(|path| drop(fs::remove_file(path)));
             self.remove_abandoned();
@@ -83,6 +84,16 @@ impl Place {
             if entry.file_type().is_ok_and(|kind| kind.is_dir()) && !has_monitor() {
                 let _ = fs::remove_dir_all(entry.path());
             }
+        }
+    }
+
+    /// Removes the files kept for successors once the last process of this instance has left in order, while other
+    /// instances go on. Only while no process can join.
+    fn remove_left_files(&self) {
+        // A killed process leaves its claim.
+        let is_left = MEMBERS.iter().all(|of| !self.claim_path_of(&self.instance, of).exists());
+        if is_left {
+            self.kept_files().for_each(|path| drop(fs::remove_file(path)));
         }
     }
 
@@ -177,13 +188,6 @@ impl Kind {
     }
 }
 
-/// Whether a process holds a claim. One that cannot be opened counts as held.
-fn is_held(claim: &Path) -> bool {
-    File::open(claim).map_or(true, |file| {
-        rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive).is_err()
-    })
-}
-
 /// Whether a file was written so recently that a successor of its writer may still start. A stamp in the future counts
 /// like one in the past: the clock may have been set.
 fn is_young(path: &Path) -> bool {
@@ -218,7 +222,7 @@ mod tests {
     /// Makes a file older than the wait for successors.
     fn age(path: &Path) {
         let long_ago = SystemTime::now() - 2 * SUCCESSOR_WAIT;
-        File::options().write(true).open(path).unwrap().set_modified(long_ago).unwrap();
+        fs::File::options().write(true).open(path).unwrap().set_modified(long_ago).unwrap();
     }
 
     #[test]
@@ -296,6 +300,23 @@ mod tests {
         drop(coming);
         place.tidy();
         assert!(!place.checkpoint_path().exists());
+    }
+
+    #[test]
+    fn the_last_process_of_an_instance_removes_its_files_while_another_instance_runs() {
+        let (folder, place) = place();
+        let node = folder.path().join("nodes/123");
+        fs::create_dir_all(&node).unwrap();
+        fs::write(folder.path().join("nodes/123.node_monitor"), "").unwrap();
+        fs::write(place.checkpoint_path(), "x").unwrap();
+        let other = folder.path().join("rig2.checkpoint");
+        fs::write(&other, "x").unwrap();
+        let tracker = place.claim("tracker").unwrap();
+        place.tidy();
+        assert!(place.checkpoint_path().exists(), "a mapper restarted alone continues");
+        drop(tracker);
+        place.tidy();
+        assert!(!place.checkpoint_path().exists() && other.exists() && node.exists());
     }
 
     #[test]

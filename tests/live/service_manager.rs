@@ -8,6 +8,9 @@ use std::process::Child;
 use crate::support::{Rig, WATCH_DOG, finish, signal, small_camera, until};
 use rustix::process::Signal;
 use semidense::wire::command::{Command, CommandClient};
+use semidense::wire::message::{GraphHeader, KeyframePoseMessage};
+use semidense::wire::port::Subscriber;
+use semidense::wire::topic::GRAPH;
 
 /// Time that the manager allows between two heartbeats: loops wake ten times a second.
 const WATCHDOG_US: &str = "800000";
@@ -162,4 +165,37 @@ fn a_mapper_that_has_written_its_map_reports_its_usual_state_again() {
     mapper.until_heard(from, "what it did before", |message| message.starts_with("STATUS=ready ("));
     drop(commands);
     mapper.stop();
+}
+
+/// The newest graph, once it has at least so many keyframes: its epoch and their numbers.
+fn graph(graphs: &Subscriber<KeyframePoseMessage, GraphHeader>, least: usize) -> (u32, Vec<u64>) {
+    until("a graph", || {
+        let newest = graphs.newest().unwrap()?;
+        let ids: Vec<u64> = newest.payload().iter().map(|of| of.keyframe_id).collect();
+        (ids.len() >= least).then_some((newest.header().epoch, ids))
+    })
+}
+
+#[test]
+fn a_mapper_that_is_restarted_alone_continues_its_map() {
+    let rig = Rig::new();
+    let tracker = Manager::start(&rig, &["tracker", "--live"]);
+    let mut mapper = Manager::start(&rig, &["mapper", "--live"]);
+    let capture = Manager::start(&rig, &["capture", "--live", "--source", "loop:1000000:20:sim"]);
+    mapper.until_heard(0, "a map", |message| message.starts_with("STATUS=running: mapping"));
+    let hub = rig.observe();
+    let graphs = hub.subscriber(&GRAPH).unwrap();
+    let (epoch, before) = graph(&graphs, 2);
+    mapper.stop();
+    let mut mapper = Manager::start(&rig, &["mapper", "--live"]);
+    mapper.until_heard(0, "its map", |message| message.starts_with("STATUS=running: mapping"));
+    let (epoch_after, after) = graph(&graphs, before.len());
+    assert_eq!(epoch_after, epoch);
+    assert!(before.iter().all(|id| after.contains(id)), "{before:?} {after:?}");
+    drop((graphs, hub));
+    // The last one to leave removes what the mapper left.
+    for process in [mapper, tracker, capture] {
+        process.stop();
+    }
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
 }

@@ -32,6 +32,11 @@ impl Numbering {
         }
     }
 
+    /// Above the numbers that a mapper which died after this checkpoint has assigned.
+    pub fn above_map(map: &Map) -> Self {
+        Self { ids: map.free_keyframe_id(), epochs: map.free_epoch, revisions: map.revision }
+    }
+
     /// A map in the numbers of the run.
     pub fn in_run(&self, map: Map) -> Map {
         let renumbered = |keyframe: Keyframe| Keyframe {

@@ -111,6 +111,11 @@ impl MapSession {
         folder.as_os_str().is_empty() || same().unwrap_or(false)
     }
 
+    /// Whether nothing is written into it.
+    pub fn is_read_only(&self) -> bool {
+        self.map_use == MapUse::Locate
+    }
+
     /// Keeps what a step or a correction changed.
     pub fn follow(&mut self, mapper: &Mapper, outcome: &StepOutcome) {
         self.keeper.iter_mut().for_each(|keeper| keeper.follow(mapper, outcome));

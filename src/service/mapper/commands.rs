@@ -3,8 +3,6 @@
 use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
-use std::thread;
-use std::time::Duration;
 
 use crate::service::checkpoint::Kept;
 use crate::service::config::MapConfig;
@@ -14,7 +12,7 @@ use crate::service::map_folder::map_folder_error::MapFolderError;
 use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::save_copy;
 use crate::service::map_folder::session::{MapSession, check_loadable};
-use crate::service::mapper::switched_map::SwitchedMap;
+use crate::service::mapper::used_map::UsedMap;
 use crate::service::mapper::{Shell, WRITES_MAP, publish_adjustments};
 use crate::service::mode::Mode;
 use crate::service::run_error::RunError;
@@ -26,8 +24,8 @@ use crate::wire::command::Command;
 
 /// Cause that a mapper reports while it reads another map, which may take long.
 const LOADS_MAP: &str = "another map is being loaded";
-/// Pause between two signs of life meanwhile.
-const LOADING_PAUSE: Duration = Duration::from_millis(20);
+const NO_MAP: &str = "it was started without a map: name the folder to save in";
+const READ_ONLY: &str = "it only localises in this map (--read-only) and has nothing to save in it: name another folder";
 const NO_FRAME: &str = "there is no map yet: no frame has arrived";
 
 /// Outcome of a command; an error is returned to its sender.
@@ -83,8 +81,11 @@ impl Shell<'_> {
 
     fn save_folder(&mut self, path: &Path) -> Answer {
         let Some((_, mapper)) = &self.mapper else { return Err(NO_FRAME.into()) };
-        if self.map.as_ref().is_some_and(|map| map.is_in(path)) {
-            return Ok(self.save_map_folder()?);
+        match &self.map {
+            None if path.as_os_str().is_empty() => return Err(NO_MAP.into()),
+            Some(map) if map.is_in(path) && map.is_read_only() => return Err(READ_ONLY.into()),
+            Some(map) if map.is_in(path) => return Ok(self.save_map_folder()?),
+            _ => {}
         }
         let (health, detail) = (&mut self.health, self.config.map.detail);
         Ok(save_copy(path, mapper, detail, &mut || health.report())?)
@@ -107,8 +108,8 @@ impl Shell<'_> {
         let map = MapConfig { folder: name.to_owned(), read_only, ..self.config.map.clone() };
         let (session, mut next) = self.start_in_map(&map, &camera, numbering)?;
         self.save_map_folder()?;
-        let switched = SwitchedMap { from: self.config.map.folder.clone(), to: map, numbering };
-        self.forget_checkpoint(&switched)?;
+        self.used = UsedMap { switched_to: Some(map), numbering, ..self.used.clone() };
+        self.forget_checkpoint()?;
         if let Some((_, before)) = self.mapper.take() {
             next.replace_mapper(before);
         }
@@ -125,39 +126,31 @@ impl Shell<'_> {
         camera: &Intrinsics,
         numbering: Numbering,
     ) -> Result<(MapSession, Mapper), String> {
-        let (mapping, pool) = (&self.config.mapping, &self.pool);
+        let config = self.config;
         let waits = self.mode == Mode::Lockstep;
         let begin = || -> Result<(MapSession, Mapper), String> {
             let missing = || MapFolderError::Missing(PathBuf::from(&map.folder)).to_string();
-            let session = MapSession::open(map, mapping.max_map_bytes(), numbering, waits);
+            let session = MapSession::open(map, config.mapping.max_map_bytes(), numbering, waits);
             let session = session.map_err(|error| error.to_string())?;
             let mut session = session.ok_or_else(missing)?;
             let mut mapper =
-                Mapper::new(*camera, mapping.clone()).map_err(|error| error.to_string())?;
+                Mapper::new(*camera, config.mapping.clone()).map_err(|error| error.to_string())?;
             session.begin(&mut mapper, camera, None).map_err(|error| error.to_string())?;
             match mapper.situation() {
                 Situation::Localising(_) => Ok((session, mapper)),
                 _ => Err(format!("{}: no keyframe to relocalise against", map.folder)),
             }
         };
-        let health = &mut self.health;
-        thread::scope(|scope| {
-            let loading = scope.spawn(|| pool.install(begin));
-            while !loading.is_finished() {
-                health.report();
-                thread::sleep(LOADING_PAUSE);
-            }
-            loading.join().unwrap_or_else(|_| Err("reading the map has failed".to_owned()))
-        })
+        self.report_while(begin).unwrap_or_else(|_| Err("reading the map has failed".to_owned()))
     }
 
     /// Live: a successor begins in the other map, not with what was left of this one.
-    fn forget_checkpoint(&mut self, switched: &SwitchedMap) -> Result<(), String> {
+    fn forget_checkpoint(&mut self) -> Result<(), String> {
         let Some(mut kept) = self.kept.take() else { return Ok(()) };
         let (path, note) = (self.place.checkpoint_path(), self.place.loaded_map_path());
         kept.remove_on_drop();
         drop(kept);
-        let written = switched.write(&note);
+        let written = self.used.write(&note);
         self.kept = Kept::open(&path).0;
         self.kept.iter_mut().for_each(Kept::reserve);
         written.map_err(|error| format!("{}: {error}", note.display()))

@@ -20,6 +20,12 @@ impl Map {
     pub fn reserve_epochs(&mut self) {
         self.free_epoch = self.free_epoch.saturating_add(UNKNOWN_EPOCHS);
     }
+
+    /// First keyframe number that a mapper which died some time after this checkpoint has not assigned.
+    pub fn free_keyframe_id(&self) -> u64 {
+        let newest = self.keyframes.iter().map(|keyframe| keyframe.keyframe_id).max();
+        newest.unwrap_or(0).saturating_add(UNKNOWN_KEYFRAMES)
+    }
 }
 
 impl Mapper {
@@ -89,11 +95,9 @@ impl Mapper {
             return StepOutcome::default();
         }
         // The dead mapper may have assigned numbers after its last checkpoint: skip these.
-        let newest = |number: fn(&Keyframe) -> u64| map.keyframes.iter().map(number).max();
-        let newest_revision = newest(|keyframe| keyframe.revision).unwrap_or(0);
-        let newest_id = newest(|keyframe| keyframe.keyframe_id).unwrap_or(0);
-        self.revision = newest_revision.saturating_add(UNKNOWN_REVISIONS);
-        self.next_keyframe_id = newest_id.saturating_add(UNKNOWN_KEYFRAMES);
+        let newest_revision = map.keyframes.iter().map(|keyframe| keyframe.revision).max();
+        self.revision = newest_revision.unwrap_or(0).saturating_add(UNKNOWN_REVISIONS);
+        self.next_keyframe_id = map.free_keyframe_id();
         self.first_free_epoch = map.free_epoch;
         let was_active = map.active.and_then(|active| map.index_of(active));
         let was_active = was_active.filter(|&index| fits(&map.keyframes[index]));
