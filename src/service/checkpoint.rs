@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
+use std::time::SystemTime;
 
 use crossbeam::queue::ArrayQueue;
 
@@ -211,7 +212,8 @@ fn as_written(read: &Map) -> Map {
     }
 }
 
-/// Writes a keyframe into a separate file and removes the oldest beyond [`KEPT_KEYFRAMES`].
+/// Writes a keyframe into a separate file and removes those beyond [`KEPT_KEYFRAMES`] that were written longest ago: the
+/// camera may be back among the first.
 fn write_keyframe(path: &Path, keyframe: Keyframe) {
     let file = keyframe_file(path, keyframe.keyframe_id);
     write_or_warn(&file, &Map { keyframes: vec![keyframe], ..Map::default() });
@@ -227,19 +229,21 @@ fn keyframe_file(path: &Path, keyframe_id: u64) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// Existing keyframe files, oldest first.
+/// Existing keyframe files, those written longest ago first.
 fn keyframe_files(path: &Path) -> Vec<(u64, PathBuf)> {
     let (Some(folder), Some(name)) = (path.parent(), path.file_name()) else { return Vec::new() };
     let beginning = format!("{}.", name.to_string_lossy());
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
-    let mut files: Vec<(u64, PathBuf)> = entries
+    let mut files: Vec<(SystemTime, u64, PathBuf)> = entries
         .filter_map(|entry| {
             let name = entry.file_name().to_string_lossy().into_owned();
-            Some((name.strip_prefix(&beginning)?.parse().ok()?, entry.path()))
+            let keyframe_id = name.strip_prefix(&beginning)?.parse().ok()?;
+            let written = entry.metadata().and_then(|file| file.modified()).ok()?;
+            Some((written, keyframe_id, entry.path()))
         })
         .collect();
     files.sort_unstable();
-    files
+    files.into_iter().map(|(_, keyframe_id, path)| (keyframe_id, path)).collect()
 }
 
 /// Removes files of mappers that were killed while writing.
@@ -262,15 +266,17 @@ pub fn read_checkpoint(path: &Path) -> Result<Option<Map>, MapFileError> {
         return Ok(None);
     }
     let mut map = read_map(path)?;
-    let without_depth = map.keyframes.iter_mut().rev().filter(|keyframe| !keyframe.has_depth());
-    for keyframe in without_depth.take(KEPT_KEYFRAMES) {
+    for (keyframe_id, file) in keyframe_files(path) {
         // A keyframe whose file was never written or is torn stays without depth.
-        let Ok(kept) = read_map(&keyframe_file(path, keyframe.keyframe_id)) else { continue };
-        let of_same = |kept: &Keyframe| {
-            (kept.keyframe_id, kept.epoch, kept.intrinsics)
-                == (keyframe.keyframe_id, keyframe.epoch, keyframe.intrinsics)
+        let (Some(index), Ok(kept)) = (map.index_of(keyframe_id), read_map(&file)) else {
+            continue;
         };
-        if let Some(kept) = kept.keyframes.into_iter().next().filter(of_same) {
+        let keyframe = &mut map.keyframes[index];
+        if keyframe.has_depth() {
+            continue;
+        }
+        if let Some(kept) = kept.keyframes.into_iter().next().filter(|kept| kept.is_same(keyframe))
+        {
             (keyframe.image, keyframe.points) = (kept.image, kept.points);
             // The flag belongs to the points taken: the state may be older or newer than they are.
             keyframe.is_refined = kept.is_refined;
@@ -372,6 +378,37 @@ mod tests {
         kept.is_over = true;
         drop(kept);
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn keyframes_of_an_epoch_that_was_joined_keep_their_depth() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.checkpoint");
+        let kept = Checkpoint::keep(&path).unwrap();
+        kept.put_keyframe(Keyframe { epoch: 1, ..keyframe(3) });
+        until(|| keyframe_file(&path, 3).exists());
+        let keyframes = vec![keyframe(3).without_depth(), keyframe(4)];
+        kept.put_now(&Map { keyframes, active: Some(4), ..Map::default() });
+        let read = read_checkpoint(&path).unwrap().unwrap();
+        assert!(read.keyframes.iter().all(Keyframe::has_depth));
+        assert_eq!(read.keyframes[0].epoch, 0, "the epoch is that of the last state");
+    }
+
+    #[test]
+    fn the_keyframes_left_last_are_kept_whatever_their_numbers() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.checkpoint");
+        let written = |id: u64| write_keyframe(&path, keyframe(id));
+        (100..100 + KEPT_KEYFRAMES as u64).for_each(written);
+        let long_ago = SystemTime::now() - Duration::from_secs(60);
+        for (_, file) in keyframe_files(&path) {
+            fs::File::options().write(true).open(file).unwrap().set_modified(long_ago).unwrap();
+        }
+        // The camera is back where it began.
+        [5, 6].into_iter().for_each(written);
+        let ids: Vec<u64> = keyframe_files(&path).into_iter().map(|(id, _)| id).collect();
+        let kept = 100 + KEPT_KEYFRAMES as u64;
+        assert_eq!(ids, (102..kept).chain([5, 6]).collect::<Vec<u64>>());
     }
 
     #[test]

@@ -52,7 +52,7 @@ impl Map {
         for keyframe in older.keyframes {
             match self.keyframes.iter_mut().find(|of| of.keyframe_id == keyframe.keyframe_id) {
                 None => self.keyframes.push(keyframe),
-                Some(known) if known.epoch != keyframe.epoch => {}
+                Some(known) if !known.is_same(&keyframe) => {}
                 Some(known) if known.has_depth() => known.description = keyframe.description,
                 Some(known) => {
                     (known.image, known.points) = (keyframe.image, keyframe.points);
