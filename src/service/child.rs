@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::os::fd::AsFd;
 use std::os::unix::process::CommandExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -122,7 +122,7 @@ impl Child {
         log: &ErrorLog,
     ) -> io::Result<Self> {
         let frames = frames.map(File::try_clone).transpose()?;
-        let mut process = command(&std::env::current_exe()?, root)
+        let mut process = command(&own_program()?, root)
             .arg(name)
             .args(arguments)
             .env(RUN_VARIABLE, run)
@@ -193,6 +193,12 @@ impl Drop for Child {
 
 fn locked(fault: &Mutex<Option<String>>) -> MutexGuard<'_, Option<String>> {
     fault.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// This program, also where its file was replaced or removed since it started.
+fn own_program() -> io::Result<PathBuf> {
+    let file = std::env::current_exe()?;
+    Ok(if file.exists() { file } else { PathBuf::from("/proc/self/exe") })
 }
 
 /// The command that starts a process for the instance in the folder `root`, in a separate process group, so that a

@@ -289,7 +289,10 @@ impl<'a> Supervisor<'a> {
             if let Some(ended) = self.check_processes()? {
                 return Ok(ended);
             }
-            self.start_due()?;
+            if let Err(error) = self.start_due() {
+                // What was recorded becomes the results.
+                return Ok(EndOfRun::Failed(error.to_string()));
+            }
             self.keep_reserved();
         }
     }

@@ -134,6 +134,7 @@ fn dead_processes_are_restarted() {
         ("all three", &|| kills_do_not_rewind(&[CAPTURE, TRACKER, MAPPER])),
         ("estimate", &a_mapper_that_dies_during_an_estimate_leaves_a_map_as_it_was_published),
         ("numbers", &a_mapper_that_dies_before_it_numbers_anything_leaves_the_first_numbers),
+        ("replaced file", &a_run_whose_program_was_replaced_starts_it_again),
         ("status", &status_knows_the_age_of_the_run_and_its_keyframes_whoever_died_or_is_stopped),
     ]);
 }
@@ -463,4 +464,25 @@ fn status_knows_the_age_of_the_run_and_its_keyframes_whoever_died_or_is_stopped(
     let (code, stderr, summary, _) = live.end();
     assert_eq!(code, Some(0), "{stderr}");
     assert!(summary["send_ms"]["p99"].as_f64().unwrap() > 0.0, "{summary}");
+}
+
+fn a_run_whose_program_was_replaced_starts_it_again() {
+    let rig = Rig::new();
+    let source = format!("loop:{FRAMES}:30:sim");
+    let command = rig.run(40, &["--live", "--source", &source]);
+    let copy = rig.folder().join("semidense");
+    fs::copy(command.get_program(), &copy).unwrap();
+    let mut of_copy = std::process::Command::new(&copy);
+    of_copy.args(command.get_args()).env("SEMIDENSE_ROOT", rig.root());
+    let piped = std::process::Stdio::piped;
+    let run = of_copy.stdin(std::process::Stdio::null()).stdout(piped()).stderr(piped());
+    let mut live = Live::watch(rig, run.spawn().unwrap());
+    live.until_frames(TRACKER, 30);
+    fs::remove_file(&copy).unwrap();
+    let before = live.pid(TRACKER);
+    live.send(&[TRACKER], Signal::KILL);
+    live.until_replaced(TRACKER, before);
+    let (code, stderr, summary, _rig) = live.end();
+    assert_eq!(code, Some(0), "{stderr}");
+    assert_eq!(summary["restarts"], 1, "{summary}");
 }
