@@ -5,7 +5,7 @@
 //! every keyframe. A save thus costs at most two keyframes, however large the map is, and a killed process leaves a map
 //! without its active keyframe. Changes that are not written yet are written at the end.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -51,10 +51,12 @@ struct Waiting {
     head: Option<MapHead>,
     is_over: bool,
     is_busy: bool,
-    /// Whether a write has failed.
-    has_failed: bool,
+    /// Keyframes of failed saves, which are handed over again.
+    failed: BTreeSet<u64>,
     /// Why the last save failed, until it is reported.
     failure: Option<String>,
+    /// Whether the last save failed.
+    is_refused: bool,
 }
 
 impl MapSaver {
@@ -93,6 +95,9 @@ impl MapSaver {
     pub fn follow(&mut self, mapper: &Mapper, outcome: &StepOutcome) {
         if !(outcome.needs_image() || outcome.graph_changed) {
             return;
+        }
+        for keyframe_id in std::mem::take(&mut locked(&self.shared.waiting).failed) {
+            self.handed.remove(&keyframe_id);
         }
         let (map, active) = (mapper.map(), mapper.keyframe().map(|keyframe| keyframe.keyframe_id));
         let of_map = map.keyframes.iter().filter(|of| is_kept(of, &self.camera));
@@ -138,11 +143,9 @@ impl MapSaver {
         let mut waiting = locked(&self.shared.waiting);
         waiting.head = None;
         // Waiting keyframes are older than those written now, and those that failed are written again.
-        for keyframe_id in std::mem::take(&mut waiting.keyframes).into_keys() {
+        let failed = std::mem::take(&mut waiting.failed);
+        for keyframe_id in std::mem::take(&mut waiting.keyframes).into_keys().chain(failed) {
             self.handed.remove(&keyframe_id);
-        }
-        if std::mem::take(&mut waiting.has_failed) {
-            self.handed.clear();
         }
         drop(waiting);
         let camera = self.camera;
@@ -231,8 +234,17 @@ fn save_waiting(shared: &Shared, camera: &Intrinsics) {
     let failure = put.and_then(|()| writer.save(camera, head)).err().map(|error| error.to_string());
     tracing::debug!("saved {} keyframes in {:?}", keyframes.len(), begin.elapsed());
     if let Some(failure) = failure {
-        tracing::warn!("{failure}; the previous save remains on disk");
         let mut waiting = locked(&shared.waiting);
-        (waiting.has_failed, waiting.failure) = (true, Some(failure));
+        waiting.failed.extend(keyframes.into_keys());
+        // A disk that stays full refuses with every keyframe.
+        if !std::mem::replace(&mut waiting.is_refused, true) {
+            tracing::warn!("{failure}; the previous save remains on disk");
+        }
+        waiting.failure = Some(failure);
+    } else {
+        locked(&shared.waiting).is_refused = false;
     }
 }
+
+#[cfg(test)]
+mod tests;

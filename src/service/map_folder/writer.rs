@@ -56,14 +56,14 @@ impl MapWriter {
         let failed = |source| MapFolderError::Write { path: folder.to_owned(), source };
         refuse_file(folder)?;
         fs::create_dir_all(folder).map_err(failed)?;
-        let manifest = match read_manifest(folder) {
-            Ok((manifest, _)) => Some(manifest),
-            Err(MapFolderError::Missing(_)) if is_free(folder).map_err(failed)? => None,
-            Err(MapFolderError::Missing(_)) => {
-                return Err(MapFolderError::Foreign(folder.to_owned()));
-            }
-            Err(error) => return Err(error),
+        let read = || match read_manifest(folder) {
+            Ok((manifest, _)) => Ok(Some(manifest)),
+            Err(MapFolderError::Missing(_)) if is_free(folder).map_err(failed)? => Ok(None),
+            Err(MapFolderError::Missing(_)) => Err(MapFolderError::Foreign(folder.to_owned())),
+            Err(error) => Err(error),
         };
+        // Someone else's folder gets no file.
+        drop(read()?);
         let lock = match lock_output(folder).map_err(failed)? {
             Locking::Locked(lock) => lock,
             Locking::HeldBy(holder) => {
@@ -71,6 +71,8 @@ impl MapWriter {
                 return Err(MapFolderError::Held { folder: folder.to_owned(), by });
             }
         };
+        // The process that held the folder until now may have saved a last time.
+        let manifest = read()?;
         fs::create_dir_all(folder.join(KEYFRAMES)).map_err(failed)?;
         let mut writer = Self {
             folder: folder.to_owned(),
