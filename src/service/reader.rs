@@ -26,6 +26,7 @@ use std::os::fd::BorrowedFd;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use crate::service::health::ProcessState;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, KeyframePose};
@@ -45,6 +46,9 @@ use crate::wire::topic::{ADJUSTMENT, FRAME, GRAPH, HEALTH_TOPICS, POSE};
 const LONGEST_SILENCE: Duration = Duration::from_secs(3);
 /// Time between two attempts to join an instance that does not run yet.
 const RETRY_PERIOD: Duration = Duration::from_millis(250);
+
+/// Attempts that a topic may prevent while it is created or removed, without being reported: a second.
+const TRANSIENT_ATTEMPTS: u32 = 4;
 
 /// Topics to read besides poses and health.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -91,7 +95,7 @@ pub struct Graph {
 /// An event from shared memory.
 #[derive(Debug, Clone)]
 pub enum Event {
-    /// An instance was joined: earlier events belong to another run.
+    /// An instance was joined, and its first messages follow: earlier events belong to another run.
     Joined,
     /// The instance is gone; the session waits for the next one.
     Left,
@@ -127,29 +131,48 @@ pub struct Session {
     name: String,
     wants: Wants,
     ports: Option<Ports>,
+    /// Whether a message has arrived at these ports: topics alone may be those of other readers.
+    is_joined: bool,
     tried: Option<Instant>,
     heard: Instant,
     refused: u64,
+    /// Why an instance that runs cannot be joined, and how many attempts in a row that reason has prevented.
+    obstacle: Option<(String, u32)>,
 }
 
 impl Session {
     /// A session with the instance at `place` under the process name `name`; joins it once it runs.
     pub fn new(place: Place, name: &str, wants: Wants) -> Self {
-        let name = name.to_owned();
-        Self { place, name, wants, ports: None, tried: None, heard: Instant::now(), refused: 0 }
+        Self {
+            place,
+            name: name.to_owned(),
+            wants,
+            ports: None,
+            is_joined: false,
+            tried: None,
+            heard: Instant::now(),
+            refused: 0,
+            obstacle: None,
+        }
     }
 
     /// As [`Self::new`], but returns an error where the instance does not run now.
     pub fn join(place: Place, name: &str, wants: Wants) -> Result<Self, OpenError> {
         let ports = Ports::open(&place, name, wants)?;
         let mut session = Self::new(place, name, wants);
-        session.ports = Some(ports);
+        (session.ports, session.is_joined) = (Some(ports), true);
         Ok(session)
     }
 
     /// Whether an instance is joined.
     pub fn is_joined(&self) -> bool {
-        self.ports.is_some()
+        self.is_joined
+    }
+
+    /// Why an instance that runs cannot be joined, e.g. as a topic has no place for another reader; it is tried again.
+    pub fn obstacle(&self) -> Option<&str> {
+        let lasting = self.obstacle.as_ref().filter(|(_, times)| *times >= TRANSIENT_ATTEMPTS);
+        lasting.map(|(reason, _)| reason.as_str())
     }
 
     /// Invalid messages that were left out.
@@ -166,53 +189,73 @@ impl Session {
         mut take: impl FnMut(Event),
     ) -> Result<(), SessionError> {
         if self.ports.is_none() {
-            self.try_to_join(&mut take)?;
+            self.try_to_join()?;
         }
         let Some(ports) = &mut self.ports else {
             return Ok(wait(&[], interrupt, timeout.min(RETRY_PERIOD))?);
         };
         wait(&ports.events(), interrupt, timeout)?;
+        // The first messages may be the last of a run that is over.
+        let mut first = Vec::new();
         let mut num_taken = 0_usize;
         let outcome = ports.take_all(&mut self.refused, &mut |event| {
             num_taken += 1;
-            take(event);
+            match self.is_joined {
+                true => take(event),
+                false => first.push(event),
+            }
         });
+        let is_over = outcome.is_err() || ports.is_over();
         if num_taken > 0 {
             self.heard = Instant::now();
         }
-        let is_silent = self.heard.elapsed() > LONGEST_SILENCE;
-        if outcome.is_err() || is_silent {
-            self.ports = None;
-            take(Event::Left);
+        if !(first.is_empty() || is_over) {
+            self.is_joined = true;
+            std::iter::once(Event::Joined).chain(first).for_each(&mut take);
+        }
+        if is_over || self.heard.elapsed() > LONGEST_SILENCE {
+            (self.ports, self.tried) = (None, Some(Instant::now()));
+            if std::mem::take(&mut self.is_joined) {
+                take(Event::Left);
+            }
         }
         Ok(())
     }
 
     /// Retries an instance that is absent or only starting; one of another version never fits.
-    fn try_to_join(&mut self, take: &mut impl FnMut(Event)) -> Result<(), SessionError> {
+    fn try_to_join(&mut self) -> Result<(), SessionError> {
         if self.tried.is_some_and(|tried| tried.elapsed() < RETRY_PERIOD) {
             return Ok(());
         }
         self.tried = Some(Instant::now());
         match Ports::open(&self.place, &self.name, self.wants) {
             Ok(ports) => {
-                self.ports = Some(ports);
-                self.heard = Instant::now();
-                take(Event::Joined);
-                Ok(())
+                (self.ports, self.heard, self.obstacle) = (Some(ports), Instant::now(), None);
             }
-            Err(error @ OpenError::Version { .. }) => Err(error.into()),
-            Err(error) => {
+            Err(error @ OpenError::Version { .. }) => return Err(error.into()),
+            Err(error) if error.is_absence() => {
                 tracing::debug!("{error}");
-                Ok(())
+                self.obstacle = None;
+            }
+            Err(error) => {
+                let reason = error.to_string();
+                let before = self.obstacle.take().filter(|(known, _)| *known == reason);
+                let times = before.map_or(0, |(_, times)| times).saturating_add(1);
+                if times == TRANSIENT_ATTEMPTS {
+                    tracing::warn!("{reason}");
+                }
+                self.obstacle = Some((reason, times));
             }
         }
+        Ok(())
     }
 }
 
 /// The open topics; the hub is dropped last.
 #[derive(Debug)]
 struct Ports {
+    /// Whether the last report of each process is that it has finished, in the order of `health`.
+    has_finished: [bool; HEALTH_TOPICS.len()],
     poses: Subscriber<PoseMessage, ()>,
     health: Vec<(&'static str, Subscriber<HealthMessage, ()>)>,
     frames: Option<Subscriber<u8, FrameHeader>>,
@@ -230,6 +273,7 @@ impl Ports {
             .map(|topic| hub.subscriber(topic).map(|port| (topic.owner, port)))
             .collect();
         Ok(Self {
+            has_finished: Default::default(),
             poses: hub.subscriber(&POSE)?,
             health: health?,
             frames: wants.frames.then(|| hub.subscriber(&FRAME)).transpose()?,
@@ -247,15 +291,24 @@ impl Ports {
         [Some(self.poses.events()), frames, keyframes].into_iter().flatten().collect()
     }
 
+    /// Whether tracker and mapper have finished: their last messages have arrived.
+    fn is_over(&self) -> bool {
+        let [_capture, tracker, mapper] = self.has_finished;
+        tracker && mapper
+    }
+
     /// Keyframes before poses: a pose names its keyframe.
     fn take_all(
         &mut self,
         refused: &mut u64,
         take: &mut dyn FnMut(Event),
     ) -> Result<(), ReceiveError> {
-        for (owner, port) in &self.health {
+        for ((owner, port), has_finished) in self.health.iter().zip(&mut self.has_finished) {
             while let Some(message) = port.receive()? {
-                message.payload().iter().for_each(|m| take(Event::Health(owner, Box::new(*m))));
+                for health in message.payload() {
+                    *has_finished = health.state == ProcessState::Finished.code();
+                    take(Event::Health(owner, Box::new(*health)));
+                }
             }
         }
         if let Some(inbox) = &mut self.keyframes {
@@ -305,3 +358,6 @@ impl Ports {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -92,9 +92,9 @@ pub fn run(common: &CommonArguments, arguments: &RecordArguments) -> CommandResu
     if let (None, Ok(_)) = (began, &summary) {
         // Nothing was recorded: do not leave an empty file behind.
         std::fs::remove_file(&output)?;
-        return Err(
-            "nothing was recorded: no instance was running; start one with `semidense run`".into(),
-        );
+        let why =
+            session.obstacle().unwrap_or("no instance was running; start one with `semidense run`");
+        return Err(format!("nothing was recorded: {why}").into());
     }
     print(&summary?, began, counts.dropped());
     Ok(ExitCode::SUCCESS)
@@ -118,7 +118,10 @@ fn read(
         })?;
         if began.is_none() && !has_said && started.elapsed() > PATIENCE {
             has_said = true;
-            note("waiting for an instance: start one with `semidense run`");
+            // Another reason has been logged.
+            if session.obstacle().is_none() {
+                note("waiting for an instance: start one with `semidense run`");
+            }
         }
         has_ended |= duration.zip(began).is_some_and(|(most, began)| began.elapsed() >= most);
     }

@@ -24,6 +24,9 @@ use crate::zenoh::unpack::Arrival;
 
 /// Period of reports during a silence, nanoseconds: that of the processes' reports.
 const REPORT_PERIOD_NANOS: i64 = 1_000_000_000;
+/// How long a finished process stays finished, nanoseconds: readers that are there learn of the end of the run within a
+/// second, and those that come later are to wait for the next run.
+const END_PERIOD_NANOS: i64 = 3_000_000_000;
 /// Name that the supervisor of a run claims.
 const SUPERVISOR: &str = "supervisor";
 
@@ -48,6 +51,8 @@ struct Reported {
     last: HealthMessage,
     /// CLOCK_MONOTONIC of its publication here.
     told_nanos: i64,
+    /// CLOCK_MONOTONIC of its arrival.
+    heard_nanos: i64,
     is_silent: bool,
 }
 
@@ -64,6 +69,7 @@ impl Mirror {
                 publisher: hub.publisher(&HEALTH_TOPICS[place], 1)?,
                 last: HealthMessage::new_zeroed(),
                 told_nanos: i64::MIN,
+                heard_nanos: i64::MIN,
                 is_silent: false,
             })
         };
@@ -122,7 +128,7 @@ impl Mirror {
         self.health.iter().for_each(|reported| reported.publisher.serve_late_joiners());
     }
 
-    /// Reports the cause of a silence once a second, as stale health. A finished process stays finished.
+    /// Reports the cause of a silence once a second, as stale health. A finished process stays finished for a while.
     pub fn report_silence(&mut self, cause: &str) -> Result<(), ZenohError> {
         let now = now_nanos();
         for reported in &mut self.health {
@@ -135,7 +141,8 @@ impl Mirror {
                 ProcessState::from_code(message.state),
                 Some(ProcessState::Finished | ProcessState::Failed)
             );
-            if !has_ended {
+            let is_recent = now.saturating_sub(reported.heard_nanos) < END_PERIOD_NANOS;
+            if !(has_ended && is_recent) {
                 message.state = ProcessState::Stale.code();
                 (message.cause, message.cause_bytes) = text_bytes(cause);
                 message.rate_hz = 0.0;
@@ -156,7 +163,8 @@ impl Mirror {
         };
         reported.last = HealthMessage { process_id: std::process::id(), ..*message };
         reported.publisher.send((), &[reported.last])?;
-        (reported.told_nanos, reported.is_silent) = (now_nanos(), false);
+        let now = now_nanos();
+        (reported.told_nanos, reported.heard_nanos, reported.is_silent) = (now, now, false);
         Ok(())
     }
 }
