@@ -199,9 +199,7 @@ impl Reader {
 
     /// Whether a topic has woken the reader.
     fn take_wakes(&self) -> Result<bool, Failure> {
-        let events: Vec<&Events> = self.events().collect();
-        let woken = events.iter().any(|events| is_readable(events.as_fd()));
-        wait(&events, None, Duration::ZERO).map_err(transport)?;
+        let woken = self.events().fold(false, |woken, events| events.take() || woken);
         if is_readable(self.heartbeat.as_fd()) {
             let mut count = [0; 8];
             // The number of missed beats does not matter.

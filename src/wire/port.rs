@@ -398,6 +398,16 @@ pub struct Events {
     listener: Listener<ipc::Service>,
 }
 
+impl Events {
+    /// Consumes the wake-ups; returns whether there were any.
+    pub fn take(&self) -> bool {
+        let mut has_woken = false;
+        // What cannot be read is read with the next wake-up.
+        let _ = self.listener.try_wait(|_| has_woken = true);
+        has_woken
+    }
+}
+
 /// Readable while a wake-up is unread, for the caller's own poll; [`wait`] consumes the wake-ups.
 impl AsFd for Events {
     fn as_fd(&self) -> BorrowedFd<'_> {
@@ -452,7 +462,7 @@ pub fn wait<'a>(
     }
     // The number of wake-ups does not matter: messages are counted separately.
     for event in events {
-        let _ = event.listener.try_wait(|_| {});
+        event.take();
     }
     Ok(())
 }
