@@ -177,11 +177,16 @@ fn a_recording_is_split_into_complete_files() {
     let path = folder.path().join("run.mcap");
     let max_bytes = Some(50_000);
     let params = RecordParams { max_bytes, ..params(&path, ImageFormat::Raw) };
+    // Left by an earlier recording.
+    let earlier = folder.path().join("run_2.mcap");
+    std::fs::write(&earlier, "mine").unwrap();
     let summary = record(params, run(60));
     assert!(summary.files.len() >= 3, "{:?}", summary.files);
+    assert_eq!(std::fs::read(&earlier).unwrap(), b"mine");
     let frames: Vec<_> = summary.files.iter().flat_map(|file| play(file)).collect();
     assert_eq!(frames.len(), 60);
-    assert_eq!(summary.files[1], folder.path().join("run_1.mcap"));
+    let names = ["run.mcap", "run_1.mcap", "run_3.mcap"].map(|name| folder.path().join(name));
+    assert_eq!(summary.files[..3], names);
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! The thread that writes queued events to one or several files.
 
 use std::collections::BTreeMap;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -44,6 +45,8 @@ pub struct Recorder {
     params: RecordParams,
     encoder: EventEncoder,
     file: RecordingFile,
+    /// Number of the last file.
+    number: usize,
     began: Instant,
     summary: RecordSummary,
 }
@@ -68,7 +71,7 @@ impl Recorder {
         let file = RecordingFile::create(&params.output, &params.instance)?;
         let encoder = EventEncoder::new(&params.instance, params.images);
         let summary = RecordSummary::default();
-        Ok(Self { params, encoder, file, began: Instant::now(), summary })
+        Ok(Self { params, encoder, file, number: 0, began: Instant::now(), summary })
     }
 
     /// Writes events until the queue's sender is gone.
@@ -105,12 +108,24 @@ impl Recorder {
         if !is_full && !is_long {
             return Ok(());
         }
-        let path = numbered(&self.params.output, self.summary.files.len() + 1);
-        let next = RecordingFile::create(&path, &self.params.instance)?;
+        let next = self.create_next()?;
         self.count();
         std::mem::replace(&mut self.file, next).finish()?;
         self.began = Instant::now();
         Ok(())
+    }
+
+    /// Creates the file with the next free number: an earlier recording may have left some.
+    fn create_next(&mut self) -> Result<RecordingFile, RecordError> {
+        loop {
+            self.number += 1;
+            let path = numbered(&self.params.output, self.number);
+            match RecordingFile::create(&path, &self.params.instance) {
+                Err(RecordError::Create { source, .. })
+                    if source.kind() == ErrorKind::AlreadyExists => {}
+                created => return created,
+            }
+        }
     }
 
     /// Adds the file to the summary.
