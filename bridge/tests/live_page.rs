@@ -211,10 +211,11 @@ fn a_server_open_to_other_machines_gets_a_token() {
     let page = get(&local, &format!("/?token={token}"), "");
     assert!(
         page.starts_with("HTTP/1.1 200")
-            && page.contains(&format!("Set-Cookie: semidense_token={token}; Path=/; HttpOnly"))
+            && page
+                .contains(&format!("Set-Cookie: semidense_token_{port}={token}; Path=/; HttpOnly"))
     );
     assert!(
-        get(&local, "/page.js", &format!("Cookie: semidense_token={token}\r\n"))
+        get(&local, "/page.js", &format!("Cookie: semidense_token_{port}={token}\r\n"))
             .starts_with("HTTP/1.1 200")
     );
     assert!(

@@ -91,6 +91,7 @@ pub fn run(common: &CommonArguments, arguments: &ViewArguments) -> CommandResult
         hosts: arguments.host.iter().cloned().chain(own_names()).collect(),
         origins: arguments.allow_origin.clone(),
         token: token.clone(),
+        ..Guard::default()
     };
     let shown = match &arguments.folder {
         Some(folder) => {

@@ -36,6 +36,8 @@ pub struct Guard {
     pub origins: Vec<String>,
     /// The required token.
     pub token: Option<String>,
+    /// The port of the server.
+    pub port: u16,
 }
 
 impl Guard {
@@ -55,9 +57,15 @@ impl Guard {
         }
         let Some(token) = &self.token else { return Ok(()) };
         let bearer = head.header("authorization").and_then(|value| value.strip_prefix("Bearer "));
-        let given = [head.parameter("token"), head.cookie(COOKIE), bearer];
+        let given = [head.parameter("token"), head.cookie(&self.cookie()), bearer];
         let is_known = given.into_iter().flatten().any(|given| is_same(given, token));
         if is_known { Ok(()) } else { Err(Refusal::Token) }
+    }
+
+    /// Name of the cookie that holds the token. Browsers send a cookie to all servers of a machine, which may have one
+    /// for each rig: the name tells them apart.
+    pub fn cookie(&self) -> String {
+        format!("semidense_token_{}", self.port)
     }
 
     /// Whether `host` is one of this server's names. A name that resolves here only by a foreign name server
@@ -76,9 +84,6 @@ impl Guard {
             || self.hosts.iter().any(|of| of.eq_ignore_ascii_case(name))
     }
 }
-
-/// Name of the cookie that holds the token.
-pub const COOKIE: &str = "semidense_token";
 
 /// Compares in a time that does not reveal how much is correct.
 fn is_same(given: &str, token: &str) -> bool {
@@ -149,12 +154,16 @@ mod tests {
         let token = new_token().unwrap();
         assert_eq!(token.len(), 2 * TOKEN_BYTES);
         assert_ne!(token, new_token().unwrap());
-        let guard = Guard { token: Some(token.clone()), ..Guard::default() };
+        let guard = Guard { token: Some(token.clone()), port: 8765, ..Guard::default() };
         let ask = |lines: &str, query: &str| {
             guard.check(&head(&format!("Host: 10.0.0.7\r\n{lines}"), query))
         };
         assert_eq!(ask("", &format!("?token={token}")), Ok(()));
-        assert_eq!(ask(&format!("Cookie: {COOKIE}={token}\r\n"), ""), Ok(()));
+        assert_eq!(ask(&format!("Cookie: semidense_token_8765={token}\r\n"), ""), Ok(()));
+        let of_both = format!("Cookie: semidense_token_8766=0; semidense_token_8765={token}\r\n");
+        assert_eq!(ask(&of_both, ""), Ok(()));
+        let of_other = format!("Cookie: semidense_token_8766={token}\r\n");
+        assert_eq!(ask(&of_other, ""), Err(Refusal::Token));
         assert_eq!(ask(&format!("Authorization: Bearer {token}\r\n"), ""), Ok(()));
         for bad in ["", "?token=", "?token=0123", "?x=1"] {
             assert_eq!(ask("", bad), Err(Refusal::Token), "{bad}");

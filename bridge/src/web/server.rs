@@ -16,7 +16,7 @@ use tungstenite::protocol::{Role, WebSocketConfig};
 
 use crate::feed::{Feed, USUAL_DEPTH};
 use crate::foxglove::{self, SUBPROTOCOLS};
-use crate::web::guard::{COOKIE, Guard, Refusal};
+use crate::web::guard::{Guard, Refusal};
 use crate::web::http::{Answer, Head, HeadError, read_head};
 use crate::web::metrics::{CONTENT_TYPE, metrics};
 use crate::web::saving::Saver;
@@ -111,7 +111,7 @@ impl Server {
         Ok(Arc::new(Self {
             listener,
             address,
-            guard,
+            guard: Guard { port: address.port(), ..guard },
             shown,
             connections: Seats::default(),
             foxglove_clients: Seats::default(),
@@ -210,8 +210,9 @@ impl Server {
         let mut answer = Answer::ok(content_type, text.as_bytes());
         if let (Some(token), true) = (&self.guard.token, path == "/") {
             // So that the page's own requests need no token in their URL.
+            let name = self.guard.cookie();
             answer.headers =
-                format!("Set-Cookie: {COOKIE}={token}; Path=/; HttpOnly; SameSite=Strict\r\n");
+                format!("Set-Cookie: {name}={token}; Path=/; HttpOnly; SameSite=Strict\r\n");
         }
         answer
     }
