@@ -73,7 +73,9 @@ impl FrameOrder {
             .and_then(|frames| stamp.checked_sub(last_stamp)?.checked_div(frames));
         match period.filter(|period| PERIODS_NANOS.contains(period)) {
             Some(period) => {
-                self.period_nanos = Some(period);
+                // A camera that stalls may not count the frames it lost.
+                let most = self.period_nanos.map_or(period, |known| known.saturating_mul(2));
+                self.period_nanos = Some(period.min(most));
                 FrameOrderOutcome::Next { missing: frames - 1 }
             }
             None => FrameOrderOutcome::ClockJump,
@@ -97,6 +99,21 @@ mod tests {
         assert_eq!(order.period_nanos(), 20_000_000);
         assert_eq!(order.arrive(&frame(11, 80)), FrameOrderOutcome::Next { missing: 2 });
         assert_eq!(order.period_nanos(), 20_000_000);
+    }
+
+    #[test]
+    fn a_stall_that_counts_no_frames_hardly_changes_the_period() {
+        let mut order = FrameOrder::default();
+        order.arrive(&frame(0, 0));
+        order.arrive(&frame(1, 1000));
+        assert_eq!(order.period_nanos(), 1_000_000_000, "the first is taken as it is");
+        order.arrive(&frame(2, 1040));
+        order.arrive(&frame(3, 3040));
+        assert_eq!(order.period_nanos(), 80_000_000);
+        for k in 4..9 {
+            order.arrive(&frame(k, 3040 + 100 * (k as i64 - 3)));
+        }
+        assert_eq!(order.period_nanos(), 100_000_000);
     }
 
     #[test]
