@@ -37,7 +37,9 @@ pub(super) fn begin_folder(output: &Path) -> io::Result<PathBuf> {
 
 /// Holds a log, to write it or to make results from it; `None` where another process holds it.
 pub fn lock(log: &Path) -> io::Result<Option<File>> {
-    let file = File::open(log)?;
+    // On NFS only a file open for writing can be held alone; one that cannot be written may be held elsewhere.
+    let open = File::options().read(true).write(true).open(log);
+    let file = open.or_else(|_| File::open(log))?;
     match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
         Ok(()) => Ok(Some(file)),
         Err(rustix::io::Errno::WOULDBLOCK) => Ok(None),
