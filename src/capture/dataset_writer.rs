@@ -92,9 +92,11 @@ impl DatasetWriter {
             return Err(DatasetError::Lens);
         }
         check_target(target, replace)?;
+        // `.` and a link cannot be renamed over: the folder itself can.
+        let target = &target.canonicalize().unwrap_or_else(|_| target.to_owned());
         let writer = Self {
             layout,
-            target: target.to_owned(),
+            target: target.clone(),
             partial: beside(target, "partial"),
             camera,
             rate_hz,

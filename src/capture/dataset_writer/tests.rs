@@ -137,3 +137,22 @@ fn stamps_and_depths_keep_their_digits() {
     assert_eq!(seconds(-5), "-0.000000005");
     assert_eq!([1.0, 13.1, 13.2, 0.0, f32::NAN].map(depth_steps), [5000, 65500, 0, 0, 0]);
 }
+
+#[test]
+fn a_link_to_a_folder_is_kept_and_its_dataset_replaced() {
+    let simulator = simulator(vec![]);
+    let folder = tempfile::tempdir().unwrap();
+    let (real, link) = (folder.path().join("real"), folder.path().join("link"));
+    fs::create_dir(&real).unwrap();
+    std::os::unix::fs::symlink(&real, &link).unwrap();
+    for replace in [false, true] {
+        write(&simulator, &link, DatasetLayout::Tum, replace).unwrap();
+        assert!(link.is_symlink() && is_dataset(&real), "{replace}");
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2);
+    }
+    // As `.` is resolved where it is the current folder.
+    let here = folder.path().join("here");
+    fs::create_dir(&here).unwrap();
+    write(&simulator, &here.join("."), DatasetLayout::Tum, false).unwrap();
+    assert!(is_dataset(&here));
+}
