@@ -48,6 +48,14 @@ systemctl restart "$(unit tracker)"
 expect "CPUAffinity" "$(taskset -cp "$(main_pid tracker)")" sh -c "taskset -cp $(main_pid tracker) | grep -q ': 1$'"
 soon "poses after a restart by hand" 120 tracks
 
+# The mapper alone: the next one continues the map.
+has_keyframes() { [ "$(status .keyframes)" -ge "$1" ]; }
+soon "three keyframes" 300 has_keyframes 3
+keyframes=$(status .keyframes)
+systemctl restart "$(unit mapper)"
+soon "a restarted mapper maps" 120 maps
+expect "its keyframes" "$keyframes before, $(status .keyframes)" has_keyframes "$keyframes"
+
 # A second rig alongside the first.
 sed 's/:5:/:3:/' /etc/semidense/robot.toml > /etc/semidense/other.toml
 rig=other
@@ -55,4 +63,5 @@ systemctl start semidense@other.target
 soon "a second rig gives poses" 300 tracks
 systemctl stop semidense@other.target
 rig=robot
+expect "it leaves no files" "$(ls /run/semidense)" sh -c '! ls /run/semidense | grep -q ^other'
 soon "the first continues" 30 tracks
