@@ -135,6 +135,8 @@ struct Job {
     keyframes: Vec<Keyframe>,
     /// All keyframes of the map without their depth, in order of their ids.
     nodes: Vec<Keyframe>,
+    /// For each of them, whether it can be compared with others.
+    is_usable: Vec<bool>,
 }
 
 impl Job {
@@ -311,9 +313,11 @@ impl Loops {
         let keyframes =
             ids.iter().filter_map(|id| map.get(*id).filter(|of| of.is_usable()).cloned());
         let keyframes: Vec<Keyframe> = keyframes.collect();
-        let mut nodes: Vec<Keyframe> = map.keyframes.iter().map(Keyframe::without_depth).collect();
+        let mut nodes: Vec<&Keyframe> = map.keyframes.iter().collect();
         nodes.sort_by_key(|node| node.keyframe_id);
-        self.job = Some(Box::new(Job { plan, keyframes, nodes }));
+        let is_usable = nodes.iter().map(|node| node.is_usable()).collect();
+        let nodes = nodes.into_iter().map(Keyframe::without_depth).collect();
+        self.job = Some(Box::new(Job { plan, keyframes, nodes, is_usable }));
         true
     }
 

@@ -154,11 +154,14 @@ fn chi2(expected: &Sim3, found: &Sim3, covariance: &Matrix7) -> f64 {
 
 /// Pairs of a neighbour of one keyframe with a neighbour of the other: they share no image with the loop.
 fn confirming(job: &Job, link: &Link) -> Vec<Pair> {
+    // Of a thinned map most keyframes have lost their depth.
     let beside = |id: u64| {
         let place = job.nodes.binary_search_by_key(&id, |node| node.keyframe_id).unwrap_or(0);
         let epoch = job.nodes.get(place).map(|node| node.epoch);
-        let places = [place.checked_sub(1), place.checked_add(1)];
-        places.map(|at| at.and_then(|at| job.nodes.get(at)).filter(|of| Some(of.epoch) == epoch))
+        let is_beside = |at: &usize| job.is_usable[*at] && Some(job.nodes[*at].epoch) == epoch;
+        let before = (0..place).rev().find(is_beside);
+        let after = (place + 1..job.nodes.len()).find(is_beside);
+        [before, after].map(|at| Some(&job.nodes[at?]))
     };
     let places = [link.i, link.j].map(|id| job.node(id).map(|node| node.map_from_keyframe));
     let [Some(i), Some(j)] = places else { return Vec::new() };

@@ -81,7 +81,8 @@ impl Course {
     fn run(&mut self) -> Vec<SearchReport> {
         let mut reports = Vec::new();
         loop {
-            let known: Vec<u64> = self.map.keyframes.iter().map(|k| k.keyframe_id).collect();
+            let known = self.map.keyframes.iter().filter(|k| k.has_depth());
+            let known: Vec<u64> = known.map(|k| k.keyframe_id).collect();
             self.loops.plan(&known, known.len());
             if !self.loops.begin(&self.map) {
                 return reports;
@@ -286,4 +287,19 @@ fn a_closure_that_was_not_applied_is_repeated() {
     assert!(course.loops.begin(&course.map));
     course.loops.run();
     assert_eq!(course.loops.take_closure(), closed);
+}
+
+#[test]
+fn a_loop_is_confirmed_where_the_keyframes_next_to_it_lost_their_depth() {
+    // Each view twice; the second is thinned.
+    let places: Vec<SE3> = round().into_iter().flat_map(|place| [place, place]).collect();
+    for seed in 0..2 {
+        let mut course = Course::of(&Scene::new(seed), &places, 0.02, 1.0, seed);
+        course.map.keyframes.iter_mut().skip(1).step_by(2).for_each(Keyframe::forget_depth);
+        let before = course.error(26, &places);
+        let reports = course.run();
+        assert!(count(&reports, |outcome| *outcome == SearchOutcome::Closed) > 0, "{reports:?}");
+        let after = course.error(26, &places);
+        assert!(after < 0.5 * before, "{seed}: {before} {after} {reports:?}");
+    }
 }
