@@ -41,14 +41,17 @@ impl ModeCovariance {
         Self { upper_triangle: [m(0, 0), m(0, 1), m(0, 2), m(1, 1), m(1, 2), m(2, 2)] }
     }
 
-    /// From a symmetric matrix that is a sum: an implausible one becomes complete ignorance.
+    /// From a symmetric matrix that is a sum: no mode is less certain than an unknown one, and what is no covariance
+    /// becomes complete ignorance.
     pub fn bounded(matrix: &Matrix3<f64>) -> Self {
-        let covariance = Self::of(matrix);
-        let largest = covariance.std_devs().max();
-        match Self::from_upper_triangle(covariance.upper_triangle) {
-            Some(covariance) if largest <= IGNORANCE => covariance,
-            _ => Self::unknown(),
-        }
+        let matrix = Self::of(matrix).matrix();
+        // Rows and columns are scaled alike: a covariance stays one, and the other modes keep theirs.
+        let factors = matrix.diagonal().map(|variance| match variance > IGNORANCE * IGNORANCE {
+            true => IGNORANCE / variance.sqrt(),
+            false => 1.0,
+        });
+        let within = matrix.component_mul(&(factors * factors.transpose()));
+        Self::from_upper_triangle(Self::of(&within).upper_triangle).unwrap_or_else(Self::unknown)
     }
 
     /// From its upper triangle, row by row; `None` where that is not a covariance, or an implausible one.
@@ -103,6 +106,11 @@ mod tests {
         for broken in [Matrix3::from_diagonal_element(f64::NAN), Matrix3::identity() * 9.0] {
             assert_eq!(ModeCovariance::bounded(&broken), ModeCovariance::of_std_devs([1.0; 3]));
         }
+        // One unknown mode leaves the others known.
+        let wide = Matrix3::new(0.01, 0.0, 0.1, 0.0, 0.04, 0.0, 0.1, 0.0, 4.0);
+        let bounded = ModeCovariance::bounded(&wide);
+        assert!((bounded.std_devs() - Vector3::new(0.1, 0.2, 1.0)).norm() < 1e-12);
+        assert!((bounded.matrix()[(0, 2)] - 0.05).abs() < 1e-12, "the correlation stays");
         for bad in [
             [f64::NAN, 0.0, 0.0, 1.0, 0.0, 1.0],
             [1.0, 0.0, 0.0, f64::INFINITY, 0.0, 1.0],
