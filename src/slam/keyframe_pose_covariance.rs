@@ -79,8 +79,10 @@ impl KeyframePoseCovariance {
             _ => 1.0,
         });
         let mut within = scaled(&matrix, &factors);
-        // Rounding may leave it above the bound.
-        (0..KEYFRAME_POSE_ERRORS).for_each(|k| within[(k, k)] = within[(k, k)].min(IGNORANCE[k]));
+        // Rounding may leave it beside the bound, by which it is recognised.
+        for k in (0..KEYFRAME_POSE_ERRORS).filter(|&k| variances[k] > IGNORANCE[k]) {
+            within[(k, k)] = IGNORANCE[k];
+        }
         Self::from_upper_triangle(Self::of(&within).upper_triangle).unwrap_or_else(Self::unknown)
     }
 
@@ -351,7 +353,7 @@ mod tests {
     fn a_variance_beyond_ignorance_is_clipped_and_the_rest_stays_unchanged() {
         let good = of_errors(&errors(0.5)).matrix() + KeyframePoseMatrix::identity() * 1e-3;
         // Only the unit is unknown, and far beyond any plausible value.
-        for beyond in [1.1, 1e9, 1e300] {
+        for beyond in [1.1, 1.5, 3.0, 6.0, 1e9, 1e300] {
             let mut scales = SVector::<f64, KEYFRAME_POSE_ERRORS>::repeat(1.0);
             scales[6] = (beyond / good[(6, 6)]).sqrt();
             let found = KeyframePoseCovariance::bounded(&scaled(&good, &scales)).matrix();
