@@ -233,9 +233,13 @@ impl Tracker {
             self.begin_turning(before, unit);
         }
         let place = self.turning.place?;
+        let since_view = frame.capture_nanos.saturating_sub(place.nanos) as f64 * 1e-9;
+        if since_view > MAX_SECONDS {
+            self.end_turning();
+            return None;
+        }
         let mut view = self.turning.view.take()?;
         let lost = self.restore_memory(before);
-        let since_view = frame.capture_nanos.saturating_sub(place.nanos) as f64 * 1e-9;
         let step = since_view.clamp(MIN_SECONDS, MAX_SECONDS);
         view.place_view(&place.world_from_view, TIGHTNESS * place.speed * step);
         let mut next = ViewPose { since_secs: place.since_secs + step, ..place };

@@ -188,3 +188,22 @@ fn nothing_is_held_when_switched_off_or_after_a_lost_frame() {
     assert!(said[last_held + 1..].iter().all(|estimate| !estimate.state.is_tracked()));
     assert!(last_held < 39);
 }
+
+#[test]
+fn a_stall_of_more_than_a_second_ends_the_hold() {
+    let scene = Scene::new(3);
+    for (stall_secs, is_held) in [(0.8, true), (1.2, false)] {
+        let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
+        tracker.adopt(Box::new(Reference::prepare(&scene.keyframe(1, SE3::identity(), 2.0))));
+        let mut track = |frame: u64, late_secs: f64| {
+            let pixels = scene.render(&CAMERA, &panned(frame, 0.0)).noisy(2.0, 10 + frame);
+            let nanos = frame as i64 * 33_333_333 + (late_secs * 1e9) as i64;
+            tracker.track(&FrameView::new(&CAMERA, frame, nanos, &pixels), &mut |_| true).state
+        };
+        assert!((0..25).all(|frame| track(frame, 0.0).is_tracked()));
+        assert_eq!(track(25, 0.0), TURNING);
+        // The camera has not turned on meanwhile: the view would fit.
+        let after = track(26, stall_secs);
+        assert_eq!(after == TURNING, is_held, "{after:?} after {stall_secs} s");
+    }
+}
