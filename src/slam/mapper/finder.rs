@@ -42,6 +42,7 @@ fn least_points(camera: &Intrinsics) -> usize {
 /// Searches keyframes for the camera; owns the buffers for that.
 #[derive(Debug)]
 pub(super) struct Finder {
+    camera: Intrinsics,
     aligner: Aligner,
     pub(super) verdict: VerdictParams,
     reference: Reference,
@@ -81,6 +82,7 @@ impl Finder {
         let levels = num_levels(width, height);
         let alignment = AlignmentParams { simd: SimdMode::Portable, ..Default::default() };
         Self {
+            camera: *intrinsics,
             aligner: Aligner::new(alignment),
             verdict: VerdictParams::default(),
             pyramid: SumPyramid::with_size(width, height, levels, finest_level(levels, &reference)),
@@ -105,13 +107,12 @@ impl Finder {
         pixels: &[u8],
         params: &RecoveryParams,
     ) -> Option<(usize, SE3)> {
-        let camera = keyframes.get(active.unwrap_or(0))?.intrinsics;
+        let camera = self.camera;
         let seen = Appearance::of(pixels, camera.width, camera.height)?;
         self.index_new(keyframes, MAX_INDEXED);
         let mut alike = self.rank_by_appearance(keyframes, active, &seen).into_iter();
         let most = params.num_keyframes;
-        let mut sharing =
-            self.rank_by_features(keyframes, active, &camera, pixels, most).into_iter();
+        let mut sharing = self.rank_by_features(keyframes, active, pixels, most).into_iter();
         let doubted = self.doubted.take();
         let mut candidates: Vec<(usize, SE3)> = Vec::new();
         for _ in 0..params.num_keyframes {
@@ -127,7 +128,15 @@ impl Finder {
         if candidates.is_empty() {
             return None;
         }
-        let (first, others) = (candidates[*searched % candidates.len().min(2)], &candidates[1..]);
+        let first = match params.keyframes_per_frame {
+            // Alone, an attempt cycles through all of them.
+            1 => {
+                *searched += 1;
+                candidates[(*searched - 1) % candidates.len()]
+            }
+            _ => candidates[*searched % candidates.len().min(2)],
+        };
+        let others = &candidates[1..];
         self.pyramid.fill(pixels);
         let rotation_rad = params.rotation_deg.to_radians();
         for attempt in 0..params.keyframes_per_frame.min(candidates.len()) {
@@ -151,20 +160,20 @@ impl Finder {
         &mut self,
         keyframes: &[Keyframe],
         active: Option<usize>,
-        camera: &Intrinsics,
         pixels: &[u8],
         most: usize,
     ) -> Vec<(usize, SE3)> {
+        let camera = self.camera;
         let Some(seen) = self.describer.describe(pixels, camera.width, camera.height) else {
             return Vec::new();
         };
-        let index_of: BTreeMap<u64, usize> = eligible(keyframes, active)
+        let index_of: BTreeMap<u64, usize> = eligible(keyframes, active, &camera)
             .map(|index| (keyframes[index].keyframe_id, index))
             .collect();
         let found = self.places.candidates(&seen, most, |id| !index_of.contains_key(&id));
         let found = found.into_iter().filter(|candidate| candidate.score >= MIN_SHARED);
         let turned = |candidate: PlaceCandidate| {
-            let rotation = candidate.rotation(camera);
+            let rotation = candidate.rotation(&camera);
             (index_of[&candidate.keyframe_id], SE3 { rotation, ..SE3::identity() })
         };
         found.map(turned).collect()
@@ -177,7 +186,7 @@ impl Finder {
         active: Option<usize>,
         seen: &Appearance,
     ) -> Vec<usize> {
-        let mut rated: Vec<(f32, usize)> = eligible(keyframes, active)
+        let mut rated: Vec<(f32, usize)> = eligible(keyframes, active, &self.camera)
             .take(MAX_COMPARED)
             .filter_map(|index| Some((self.appearance(&keyframes[index])?.similarity(seen), index)))
             .filter(|(similarity, _)| *similarity > MIN_SIMILARITY)
@@ -204,10 +213,13 @@ impl Finder {
         /// An alignment that moves further fits something else.
         const MAX_ERROR_DEG: f64 = 15.0;
         let most = params.keyframes_per_frame.min(params.num_keyframes);
-        let camera = keyframes.get(active.unwrap_or(0)).filter(|_| most > 0)?.intrinsics;
+        if most == 0 {
+            return None;
+        }
+        let camera = self.camera;
         let seen = Appearance::of(pixels, camera.width, camera.height)?;
         self.index_new(keyframes, MAX_INDEXED);
-        let eligible: Vec<usize> = eligible(keyframes, active)
+        let eligible: Vec<usize> = eligible(keyframes, active, &camera)
             .filter(|index| Some(*index) != self.doubted)
             .filter(|&index| self.appearance(&keyframes[index]).is_some())
             .collect();
@@ -285,7 +297,7 @@ impl Finder {
 
     /// Aligns a frame to `keyframe` from the expected pose; `None` where it does not fit, or ends further from that
     /// pose than `max_disagreement`, translation in mean depths plus rotation in radians.
-    pub(super) fn inverse_transform_pose(
+    pub(super) fn locate(
         &mut self,
         keyframe: &Keyframe,
         pixels: &[u8],
@@ -345,11 +357,17 @@ impl Finder {
     }
 }
 
-/// Keyframes that may become active again, the newest first. The tracker itself searches around the active one.
-fn eligible(keyframes: &[Keyframe], active: Option<usize>) -> impl Iterator<Item = usize> {
+/// Keyframes of this camera that may become active again, the newest first: those of another stay in the map when
+/// capture is restarted with it. The tracker itself searches around the active one.
+fn eligible(
+    keyframes: &[Keyframe],
+    active: Option<usize>,
+    camera: &Intrinsics,
+) -> impl Iterator<Item = usize> {
     let is_eligible = move |index: &usize| {
         let keyframe = &keyframes[*index];
         Some(*index) != active
+            && keyframe.intrinsics == *camera
             && keyframe.map_state == MapState::Established
             && keyframe.points.len() >= least_points(&keyframe.intrinsics)
     };

@@ -190,9 +190,7 @@ impl Mapper {
         let is_young = self.is_young(epoch);
         let mut agrees = |(_, other, expected): &(f64, usize, SE3)| {
             let keyframe = &self.map.keyframes[*other];
-            self.finder
-                .inverse_transform_pose(keyframe, pixels, expected, by.max_disagreement)
-                .is_some()
+            self.finder.locate(keyframe, pixels, expected, by.max_disagreement).is_some()
         };
         others.is_empty() && is_young || others.iter().any(&mut agrees)
     }

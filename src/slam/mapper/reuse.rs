@@ -107,12 +107,7 @@ impl Mapper {
         let map_from_camera = present.map_from_keyframe.transform_pose(&pose.keyframe_from_camera);
         let (index, expected) = self.nearest_keyframe(&map_from_camera, max_distance)?;
         let keyframe = self.map.keyframes.get(index)?;
-        let located = self.finder.inverse_transform_pose(
-            keyframe,
-            frame.pixels,
-            &expected,
-            max_disagreement,
-        )?;
+        let located = self.finder.locate(keyframe, frame.pixels, &expected, max_disagreement)?;
         Some(NearKeyframe { index, keyframe_id: keyframe.keyframe_id, located })
     }
 

@@ -171,3 +171,41 @@ fn further_keyframes_are_tried_where_the_first_does_not_align() {
     };
     assert_eq!((find(1), find(2)), (None, Some(1)));
 }
+
+#[test]
+fn a_single_attempt_per_frame_reaches_every_candidate() {
+    let scene = Scene::new(3);
+    let turned = |angle: f64| at([0.0, 0.0, 0.0, 0.0, angle, 0.0]);
+    let angles = [0.0, 0.3, -0.3, 0.6, 2.8];
+    let keyframes: Vec<Keyframe> =
+        (0..).zip(angles).map(|(id, angle)| keyframe(&scene, id, turned(angle))).collect();
+    let mut finder = Finder::new(&CAMERA);
+    let params = RecoveryParams { keyframes_per_frame: 1, num_keyframes: 4, ..Default::default() };
+    let pixels = scene.render(&CAMERA, &turned(0.1)).noisy(2.0, 9);
+    let mut searched = 0;
+    let mut found = std::collections::BTreeSet::new();
+    for _ in 0..4 {
+        let tried = finder.find(&mut keyframes.clone(), Some(4), &mut searched, &pixels, &params);
+        found.extend(tried.map(|(index, _)| index));
+    }
+    assert!(searched == 4 && found.len() >= 3, "{searched} searches, found on {found:?}");
+}
+
+#[test]
+fn keyframes_of_another_camera_are_not_searched() {
+    let scene = Scene::new(3);
+    let mut known = keyframe(&scene, 0, SE3::identity());
+    let pixels = known.image.clone();
+    let active = keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
+    let params = RecoveryParams::default();
+    let find = |known: &Keyframe| {
+        let mut keyframes = [known.clone(), active.clone()];
+        let mut finder = Finder::new(&CAMERA);
+        let by_alignment = finder.find(&mut keyframes, Some(1), &mut 0, &pixels, &params);
+        let turned = finder.find_turned(&mut keyframes, Some(1), &mut 0, &pixels, &params);
+        (by_alignment.is_some(), turned.is_some())
+    };
+    assert_eq!(find(&known), (true, true));
+    known.intrinsics.fx *= 1.01;
+    assert_eq!(find(&known), (false, false));
+}
