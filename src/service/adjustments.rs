@@ -309,6 +309,8 @@ fn fate(mapper: &Mapper, in_flight: &InFlight) -> Fate {
 /// What is to be published after both steps.
 fn merged_outcome(one: StepOutcome, other: StepOutcome) -> StepOutcome {
     StepOutcome {
+        keyframe_created: one.keyframe_created || other.keyframe_created,
+        keyframe_restored: one.keyframe_restored || other.keyframe_restored,
         keyframe_changed: one.keyframe_changed || other.keyframe_changed,
         graph_changed: one.graph_changed || other.graph_changed,
         ..one

@@ -152,6 +152,19 @@ mod tests {
     }
 
     #[test]
+    fn a_keyframe_that_changes_its_epoch_publishes_its_image_again() {
+        for of_active in [0, 1] {
+            let mut mapper = mapper();
+            mapper.map.keyframes[1].epoch = of_active;
+            let join = EpochJoin { epoch: 1, into: 0, into_from_epoch: Sim3::identity() };
+            let closure = Closure { epoch: 0, moves: Vec::new(), join: Some(join) };
+            let outcome = mapper.close_loop(&closure, &mut window());
+            assert_eq!(mapper.keyframe().unwrap().epoch, 0);
+            assert_eq!(outcome.needs_image(), of_active == 1, "its epoch was {of_active}");
+        }
+    }
+
+    #[test]
     fn an_epoch_that_is_resumed_has_the_unit_of_odometry_on_whichever_keyframe_the_camera_is_found()
     {
         for found_on in 0..2 {

@@ -37,7 +37,14 @@ impl Mapper {
         let scale = self.world_from_map.scale / unit;
         self.world_from_map = Sim3::between(&after, &world_from_camera, scale);
         self.publish_pose();
-        Ok(StepOutcome { keyframe_changed: true, graph_changed: true, ..finished })
+        // A joined keyframe has another epoch, and so has its image.
+        let keyframe_restored = correction.joins.iter().any(|join| Some(join.epoch) == epoch);
+        Ok(StepOutcome {
+            keyframe_changed: true,
+            graph_changed: true,
+            keyframe_restored,
+            ..finished
+        })
     }
 
     /// Pose in the map of the last frame tracked in the active epoch, or else of the active keyframe.
