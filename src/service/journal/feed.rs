@@ -25,8 +25,8 @@ pub struct KeyframeFeed {
     image: Option<(KeyframeImageHeader, Vec<u8>)>,
     /// Revision in the journal, and since when.
     kept: Option<(u64, Instant)>,
-    /// Poses in the journal, by epoch and keyframe.
-    poses: HashMap<(u32, u64), KeyframePose>,
+    /// Epochs and poses in the journal, by keyframe.
+    poses: HashMap<u64, (u32, KeyframePose)>,
 }
 
 impl KeyframeFeed {
@@ -46,9 +46,8 @@ impl KeyframeFeed {
     /// Takes in what has arrived and gives the journal what is due; at the end everything is.
     pub fn collect(&mut self, journal: &mut Journal, is_end: bool) -> Result<(), ReceiveError> {
         while let Some(depth) = self.depths.receive()? {
-            let of = |header: &KeyframeHeader| (header.epoch, header.keyframe_id);
-            let before = self.depth.as_ref().map(|(before, _)| of(before));
-            if before.is_some_and(|before| before != of(depth.header())) {
+            let before = self.depth.as_ref().map(|(before, _)| before.keyframe_id);
+            if before.is_some_and(|before| before != depth.header().keyframe_id) {
                 // The last depth of a keyframe, while its image is still held.
                 self.keep(journal);
                 self.kept = None;
@@ -80,11 +79,10 @@ impl KeyframeFeed {
         match keyframe_from_messages(header, points, image_header, pixels) {
             Err(error) => tracing::warn!("mapper/keyframe: {error}"),
             Ok(keyframe) => {
-                let (revision, key) = (keyframe.revision, (keyframe.epoch, keyframe.keyframe_id));
-                let pose = KeyframePose::of(&keyframe);
+                let (epoch, pose) = (keyframe.epoch, KeyframePose::of(&keyframe));
                 if journal.put_keyframe(keyframe).is_none() {
-                    self.kept = Some((revision, Instant::now()));
-                    self.poses.insert(key, pose);
+                    self.kept = Some((pose.revision, Instant::now()));
+                    self.poses.insert(pose.keyframe_id, (epoch, pose));
                 }
             }
         }
@@ -96,11 +94,12 @@ impl KeyframeFeed {
         let epoch = graph.header().epoch;
         for message in graph.payload() {
             let Ok(pose) = keyframe_pose_from_message(message) else { continue };
-            let known = self.poses.get_mut(&(epoch, pose.keyframe_id));
-            let is_moved =
-                |known: &&mut KeyframePose| known.map_from_keyframe != pose.map_from_keyframe;
+            let known = self.poses.get_mut(&pose.keyframe_id);
+            let is_moved = |(of, known): &&mut (u32, KeyframePose)| {
+                (*of, known.map_from_keyframe) != (epoch, pose.map_from_keyframe)
+            };
             if let Some(known) = known.filter(is_moved) {
-                *known = pose;
+                *known = (epoch, pose);
                 journal.append(&Record::KeyframePose(epoch, pose));
             }
         }

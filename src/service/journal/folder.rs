@@ -9,6 +9,7 @@ use rustix::fs::FlockOperation;
 
 use crate::service::atomic_file::write_privately;
 use crate::service::results::output_folder::{PARENT, utc_stamp};
+use crate::slam::keyframe::Keyframe;
 use crate::wire::place::Place;
 
 /// Prefix of a journal's name, before the second (UTC) of its start and the process id.
@@ -20,9 +21,9 @@ const POINTER_SUFFIX: &str = ".journal";
 /// Prefix of keyframe files.
 const KEYFRAME_PREFIX: &str = "keyframe-";
 
-/// Name of the file of a keyframe.
-pub(super) fn keyframe_file(epoch: u32, keyframe_id: u64) -> String {
-    format!("{KEYFRAME_PREFIX}{epoch}-{keyframe_id}.map")
+/// Name of the file of a keyframe, whose epoch may change when epochs are joined.
+pub(super) fn keyframe_file(keyframe: &Keyframe) -> String {
+    format!("{KEYFRAME_PREFIX}{}-{}.map", keyframe.keyframe_id, keyframe.sequence)
 }
 
 /// Makes the folder of a new journal in `output`, for this user alone: it holds images.

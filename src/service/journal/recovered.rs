@@ -41,8 +41,9 @@ pub struct Recovered {
     pub ended: SystemTime,
     /// The last counters; at least as many frames as poses.
     pub counters: RunCounters,
-    /// Keyframes by epoch and id, without image and points.
-    keyframes: BTreeMap<(u32, u64), Keyframe>,
+    /// Keyframes by id and the sequence of their frame, without image and points. Their epochs change where one is
+    /// joined to another.
+    keyframes: BTreeMap<(u64, u64), Keyframe>,
 }
 
 impl Recovered {
@@ -93,11 +94,12 @@ impl Recovered {
             }
             Record::Counters(counters) => self.counters = *counters,
             Record::Keyframe(keyframe) => {
-                self.keyframes.insert((keyframe.epoch, keyframe.keyframe_id), *keyframe);
+                self.keyframes.insert((keyframe.keyframe_id, keyframe.sequence), *keyframe);
             }
             Record::KeyframePose(epoch, pose) => {
-                if let Some(keyframe) = self.keyframes.get_mut(&(epoch, pose.keyframe_id)) {
-                    keyframe.map_from_keyframe = pose.map_from_keyframe;
+                let of_id = (pose.keyframe_id, 0)..=(pose.keyframe_id, u64::MAX);
+                if let Some((_, keyframe)) = self.keyframes.range_mut(of_id).next_back() {
+                    (keyframe.epoch, keyframe.map_from_keyframe) = (epoch, pose.map_from_keyframe);
                 }
             }
         }
@@ -113,7 +115,7 @@ impl Recovered {
             if bytes > max_bytes {
                 break;
             }
-            let path = folder.join(keyframe_file(keyframe.epoch, keyframe.keyframe_id));
+            let path = folder.join(keyframe_file(keyframe));
             let Ok(map) = read_map(&path) else { continue };
             let Some(kept) = map.keyframes.into_iter().next() else { continue };
             if kept.intrinsics == keyframe.intrinsics {
@@ -140,10 +142,7 @@ fn take_depth(keyframe: &mut Keyframe, from: Keyframe) {
 /// keyframes it never received.
 pub fn complete(map: &mut Map, journal: Map) {
     for kept in journal.keyframes {
-        let is_same = |keyframe: &Keyframe| {
-            (keyframe.epoch, keyframe.keyframe_id) == (kept.epoch, kept.keyframe_id)
-        };
-        match map.keyframes.iter().position(is_same) {
+        match map.keyframes.iter().position(|keyframe| keyframe.is_same(&kept)) {
             Some(index) if map.keyframes[index].points.is_empty() && !kept.points.is_empty() => {
                 take_depth(&mut map.keyframes[index], kept);
             }
@@ -152,4 +151,51 @@ pub fn complete(map: &mut Map, journal: Map) {
         }
     }
     map.keyframes.sort_by_key(|keyframe| (keyframe.epoch, keyframe.keyframe_id));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::service::results::record::RunMode;
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::keyframe::KeyframePose;
+
+    fn keyframe(keyframe_id: u64, epoch: u32) -> Keyframe {
+        let at = Keyframe::at(Sim3::identity(), Intrinsics::pinhole(4, 4, 4.0), Vec::new(), vec![]);
+        Keyframe { keyframe_id, epoch, sequence: 10 * keyframe_id, ..at }
+    }
+
+    #[test]
+    fn a_joined_keyframe_is_one_keyframe_in_its_new_epoch() {
+        let start = RunStart {
+            mode: RunMode::Live,
+            source: "sim".into(),
+            rig: None,
+            folder: "/x".into(),
+            config: String::new(),
+            poses_given: false,
+            is_depth_from_sensor: false,
+            began_nanos: 0,
+        };
+        let mut found = Recovered::of(start);
+        for (id, epoch) in [(0, 0), (1, 1), (2, 1)] {
+            found.take(Record::Keyframe(Box::new(keyframe(id, epoch))));
+        }
+        // Epoch 1 is joined to 0: one keyframe moves, another is written again.
+        let map_from_keyframe = Sim3 { scale: 2.0, ..Sim3::identity() };
+        let pose = KeyframePose { keyframe_id: 1, revision: 9, map_from_keyframe };
+        found.take(Record::KeyframePose(0, pose));
+        found.take(Record::Keyframe(Box::new(keyframe(2, 0))));
+        let journal = found.map(Path::new("/nonexistent"), 0);
+        let epochs: Vec<_> = journal.keyframes.iter().map(|k| (k.keyframe_id, k.epoch)).collect();
+        assert_eq!(epochs, [(0, 0), (1, 0), (2, 0)]);
+        assert_eq!(journal.keyframes[1].map_from_keyframe, map_from_keyframe);
+        // A mapper's map that the journal has in an older state.
+        let mut map = Map { keyframes: vec![keyframe(0, 0), keyframe(1, 0)], ..Map::default() };
+        let old = Map { keyframes: vec![keyframe(1, 1), keyframe(2, 1)], ..Map::default() };
+        complete(&mut map, old);
+        let epochs: Vec<_> = map.keyframes.iter().map(|k| (k.keyframe_id, k.epoch)).collect();
+        assert_eq!(epochs, [(0, 0), (1, 0), (2, 1)]);
+    }
 }

@@ -26,9 +26,9 @@ pub struct ReplayJournal {
     poses: usize,
     steps: usize,
     adjustments: usize,
-    /// Revisions in the journal, by epoch and keyframe.
-    revisions: HashMap<(u32, u64), u64>,
-    active: Option<(u32, u64)>,
+    /// Revisions in the journal, by keyframe.
+    revisions: HashMap<u64, u64>,
+    active: Option<u64>,
     looked: Instant,
 }
 
@@ -55,8 +55,7 @@ impl ReplayJournal {
     /// Takes in what a frame has added.
     pub fn observe(&mut self, progress: &ReplayProgress<'_>) {
         self.take_poses(progress.record, code_from_start_frame(progress.start_frame));
-        let key = |keyframe: &Keyframe| (keyframe.epoch, keyframe.keyframe_id);
-        let active = progress.keyframe.map(key);
+        let active = progress.keyframe.map(|keyframe| keyframe.keyframe_id);
         let has_changed = active != self.active;
         if has_changed || self.looked.elapsed() >= PERIOD {
             self.looked = Instant::now();
@@ -90,18 +89,17 @@ impl ReplayJournal {
     }
 
     /// Gives the journal every keyframe whose state there is older. Of older keyframes, many of which a correction
-    /// moves, only the poses: their depth hardly changes any more, and takes 2 MB each.
+    /// moves, and of those that have lost their depth, only the poses: depth hardly changes any more, and takes 2 MB each.
     fn take_keyframes(&mut self, keyframes: &[Keyframe]) {
         const WITH_DEPTH: usize = 3;
         let older = keyframes.len().saturating_sub(WITH_DEPTH);
-        let held = keyframes.iter().enumerate().filter(|(_, keyframe)| keyframe.has_depth());
-        for (index, keyframe) in held {
-            let key = (keyframe.epoch, keyframe.keyframe_id);
+        for (index, keyframe) in keyframes.iter().enumerate() {
+            let key = keyframe.keyframe_id;
             let known = self.revisions.get(&key);
-            if known == Some(&keyframe.revision) {
+            if known == Some(&keyframe.revision) || known.is_none() && !keyframe.has_depth() {
                 continue;
             }
-            if known.is_some() && index < older {
+            if known.is_some() && (index < older || !keyframe.has_depth()) {
                 let pose = KeyframePose::of(keyframe);
                 self.journal.append(&Record::KeyframePose(keyframe.epoch, pose));
             } else if self.journal.put_keyframe(keyframe.clone()).is_some() {

@@ -196,7 +196,7 @@ impl Writer {
 
     /// Replaces the file of a keyframe, and removes the oldest files beyond the limit.
     fn write_keyframe(&mut self, keyframe: Keyframe) -> io::Result<()> {
-        let path = self.folder.join(keyframe_file(keyframe.epoch, keyframe.keyframe_id));
+        let path = self.folder.join(keyframe_file(&keyframe));
         let temporary = path.with_extension("tmp");
         let mut bytes = Vec::new();
         write_map_into(&mut bytes, &Map { keyframes: vec![keyframe], ..Map::default() })?;
