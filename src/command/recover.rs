@@ -76,7 +76,13 @@ pub fn run(config: &Config, arguments: &RecoverArguments) -> CommandResult {
     }
     let output = OutputFolder::of_recovery(&output)?;
     let start = recovered.start.clone();
-    let mut config = Config::from_text(&start.config, "the journal's configuration")?;
+    let config = Config::from_text(&start.config, "the journal's configuration");
+    let mut config = config.unwrap_or_else(|error| {
+        note(&format!(
+            "warning: {error}; it was written by another version, and the results are made with the defaults"
+        ));
+        Config::default()
+    });
     config.results = arguments.points.of(&config.results);
     let mut source = source_of(&start, &config);
     let record = record_of(recovered, &config, &found.folder, source.as_ref());
@@ -146,8 +152,13 @@ fn find(place: &Place, folder: Option<&Path>) -> Result<Unfinished, Box<dyn Erro
                 return Err(format!("{} is not a folder; check the path", folder.display()).into());
             }
             let wanted = folder.canonicalize()?;
-            let all = unfinished(None, folder).into_iter();
-            all.filter(|f| f.output() == wanted || f.folder == wanted).collect()
+            // The folder of the run, or its journal.
+            let around = wanted.parent().map_or_else(Vec::new, |parent| unfinished(None, parent));
+            let all = unfinished(None, folder).into_iter().chain(around);
+            let mut found: Vec<Unfinished> =
+                all.filter(|f| f.output() == wanted || f.folder == wanted).collect();
+            found.dedup_by(|one, other| one.folder == other.folder);
+            found
         }
         None => unfinished(Some(place), Path::new(PARENT)),
     };
