@@ -8,7 +8,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use crate::capture::source::FrameSource;
 use crate::capture::source_name::SourceName;
-use crate::command::print::{note, print, print_as};
+use crate::command::print::{note, print_as, print_outcome};
 use crate::command::progress::Progress;
 use crate::command::{CommandResult, INTERRUPTED, NOTHING_TRACKED};
 use crate::service::config::{Config, MapConfig};
@@ -93,7 +93,7 @@ impl Ending<'_> {
             let (recovery, refused) =
                 (recovery_text(&results.summary), refused_text(&results.summary));
             let map = map_text(&self.config.map).map_or(String::new(), |text| format!("{text}\n"));
-            print(&format!("{map}{where_to}{recovery}{refused}\n"))?;
+            print_outcome(&format!("{map}{where_to}{recovery}{refused}\n"))?;
         }
         self.conclude(&record.ended, &results.summary, &where_to)
     }

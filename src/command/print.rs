@@ -28,7 +28,15 @@ pub fn print(text: &str) -> Result<(), PrintError> {
     Ok(stdout.flush()?)
 }
 
-/// Prints `value` as JSON if `json`, else as text.
+/// Prints the outcome of a command: its exit code is the same where the reader has closed the pipe.
+pub fn print_outcome(text: &str) -> Result<(), PrintError> {
+    match print(text) {
+        Err(error) if error.is_reader_gone() => Ok(()),
+        printed => printed,
+    }
+}
+
+/// Prints `value`, the outcome of a command, as JSON if `json`, else as text.
 pub fn print_as<T: Serialize>(
     json: bool,
     value: &T,
@@ -38,7 +46,7 @@ pub fn print_as<T: Serialize>(
         true => format!("{}\n", serde_json::to_string_pretty(value)?),
         false => in_words(value),
     };
-    Ok(print(&text)?)
+    Ok(print_outcome(&text)?)
 }
 
 /// Prints a line to standard error and ignores failure, which could not be reported. Never waits indefinitely
