@@ -18,6 +18,9 @@ use crate::wire::place::Place;
 /// Largest file, bytes: two paths of maximal length, every byte of them escaped.
 const MAX_BYTES: u64 = 1 << 16;
 
+/// Stands for the folder in a note that cannot be read.
+const UNKNOWN: &str = "?";
+
 /// The map on disk that a mapper uses.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -39,7 +42,12 @@ pub(super) fn open_checkpoint(
     let (path, note) = (place.checkpoint_path(), place.loaded_map_path());
     let (mut kept, mut left) = Kept::open(&path);
     let mut used = UsedMap::of(configured);
-    match UsedMap::read(&note) {
+    // A note that cannot be read may be that of a mapper with any map.
+    let before = UsedMap::read(&note).unwrap_or_else(|error| {
+        tracing::warn!("{}: {error}", note.display());
+        Some(UsedMap { configured: UNKNOWN.to_owned(), ..UsedMap::default() })
+    });
+    match before {
         Some(before) if before.configured == configured.folder => used = before,
         Some(before) => {
             if let Some(map) = &left {
@@ -65,6 +73,7 @@ pub(super) fn open_checkpoint(
 fn left_out(before: &str, now: &str) -> String {
     let name = |folder: &str| match folder {
         "" => "without a map".to_owned(),
+        UNKNOWN => "with an unknown map".to_owned(),
         folder => format!("with the map {folder}"),
     };
     format!(
@@ -89,22 +98,14 @@ impl UsedMap {
         Self { configured: configured.folder.clone(), ..Self::default() }
     }
 
-    /// Reads what the previous mapper noted at `path`.
-    fn read(path: &Path) -> Option<Self> {
+    /// Reads what the previous mapper noted at `path`; `None` where it noted nothing.
+    fn read(path: &Path) -> io::Result<Option<Self>> {
         let mut bytes = Vec::new();
         match input_file::read_into(path, MAX_BYTES, &mut bytes) {
-            Ok(()) => {}
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return None,
-            Err(error) => {
-                tracing::warn!("{}: {error}; using the configured map", path.display());
-                return None;
-            }
+            Ok(()) => Ok(Some(serde_json::from_slice(&bytes)?)),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(error),
         }
-        let read = serde_json::from_slice(&bytes);
-        let read = read.inspect_err(|error| {
-            tracing::warn!("{}: {error}; using the configured map", path.display());
-        });
-        read.ok()
     }
 
     /// Writes it to `path`.
@@ -178,11 +179,12 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_note_is_the_configured_map() {
+    fn with_a_damaged_note_only_the_numbers_continue() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("rig.map");
-        assert_eq!(UsedMap::read(&path), None);
-        fs::write(&path, "{}").unwrap();
-        assert_eq!(UsedMap::read(&path), None);
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        left(&place);
+        fs::write(place.loaded_map_path(), "{}").unwrap();
+        let (_, map, used) = open_checkpoint(&place, &config("/a"));
+        assert!(map.is_none() && used.numbering.ids > 7);
     }
 }
