@@ -116,15 +116,22 @@ class Reader:
         return True
 
     def read(self, timeout: float = 0.0) -> List[Message]:
-        """Pending messages, waiting for at most `timeout` seconds; also empty when the run is over (`is_open`)."""
+        """Pending messages, waiting for at most `timeout` seconds; also empty when the run is over (`is_open`).
+
+        With `follow` a later call joins the next run, if it has begun.
+        """
         end = time.monotonic() + timeout
+        if self._ports is None and self._follow:
+            self._try_to_join(None)
         while True:
             messages = list(self._take())
             left = end - time.monotonic()
-            if messages or self._ports is None or left <= 0.0:
+            if messages or self._ports is None:
                 return messages
             if self._is_over():
                 self.close()
+            elif left <= 0.0:
+                return messages
             else:
                 self._ports.wait(min(left, WAIT_SECS))
 
