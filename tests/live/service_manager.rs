@@ -28,6 +28,8 @@ impl Manager {
     /// Starts a process as a service manager would.
     fn start(rig: &Rig, arguments: &[&str]) -> Self {
         let path = rig.folder().join(format!("{}.notify", arguments[0]));
+        // Of the one before it.
+        drop(std::fs::remove_file(&path));
         let socket = UnixDatagram::bind(&path).unwrap();
         socket.set_nonblocking(true).unwrap();
         let mut command = rig.command(arguments);

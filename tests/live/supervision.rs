@@ -134,7 +134,6 @@ fn dead_processes_are_restarted() {
         ("all three", &|| kills_do_not_rewind(&[CAPTURE, TRACKER, MAPPER])),
         ("estimate", &a_mapper_that_dies_during_an_estimate_leaves_a_map_as_it_was_published),
         ("numbers", &a_mapper_that_dies_before_it_numbers_anything_leaves_the_first_numbers),
-        ("replaced file", &a_run_whose_program_was_replaced_starts_it_again),
         ("status", &status_knows_the_age_of_the_run_and_its_keyframes_whoever_died_or_is_stopped),
     ]);
 }
@@ -156,6 +155,7 @@ fn outside_interference_does_not_affect_a_run() {
     at_once(&[
         ("closed terminal", &a_closed_terminal_ends_a_run_with_its_results),
         ("unread standard error", &a_standard_error_that_nobody_reads_holds_nothing_up),
+        ("replaced file", &a_run_whose_program_was_replaced_starts_it_again),
         ("full shared memory", &shared_memory_that_others_fill_costs_a_run_nothing),
     ]);
 }
