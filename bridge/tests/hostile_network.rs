@@ -73,17 +73,22 @@ impl Attack {
 
     /// Checks that a valid pose arrives, and none before it.
     fn assert_works(&self, number: u64) {
-        let mut pose = PoseMessage::new_zeroed();
-        pose.sequence = 1_000_000 + number;
-        for transform in
-            [&mut pose.world_from_camera, &mut pose.map_from_camera, &mut pose.keyframe_from_camera]
-        {
-            transform[3] = 1.0;
-        }
+        let pose = valid_pose(number);
         self.put_message(Kind::Pose, number, &pose, &Packed::empty());
         let arrived = until("the right pose", || self.poses.receive().unwrap());
         assert_eq!(arrived.payload()[0].sequence, pose.sequence, "{}", self.receiver.said());
     }
+}
+
+fn valid_pose(number: u64) -> PoseMessage {
+    let mut pose = PoseMessage::new_zeroed();
+    pose.sequence = 1_000_000 + number;
+    for transform in
+        [&mut pose.world_from_camera, &mut pose.map_from_camera, &mut pose.keyframe_from_camera]
+    {
+        transform[3] = 1.0;
+    }
+    pose
 }
 
 #[test]
@@ -121,7 +126,7 @@ fn malformed_messages_are_refused_and_valid_ones_still_arrive() {
     attack
         .put(Kind::Pose, seal(&ORIGIN, Kind::Graph, 11, &GraphHeader::default(), &Packed::empty()));
     let other = Origin { sender: 8, ..ORIGIN };
-    attack.put(Kind::Pose, seal(&other, Kind::Pose, 12, &pose, &Packed::empty()));
+    attack.put(Kind::Pose, seal(&other, Kind::Pose, 12, &valid_pose(12), &Packed::empty()));
     attack.assert_works(13);
     assert!(attack.receiver.interrupt(), "{}", attack.receiver.said());
 }

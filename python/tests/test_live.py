@@ -52,7 +52,8 @@ def test_velocity_is_the_change_of_the_pose(running: Rig) -> None:
             in_camera = after.world_from_camera.rotation.T @ moved / seconds
             scale = max(float(np.linalg.norm(in_camera)), 1e-3)
             errors.append(float(np.linalg.norm(in_camera - after.velocity.linear)) / scale)
-    assert not errors or np.median(errors) < 0.1, errors
+    if sys.version_info >= (3, 10):
+        assert errors and np.median(errors) < 0.1, errors
 
 
 def test_a_pose_is_what_the_run_writes_down(rig: Rig) -> None:
@@ -167,7 +168,8 @@ def saved(rig: Rig, folder: Any) -> bool:
 def test_two_readers_at_a_time(running: Rig) -> None:
     first, second = semidense.poses(**options(running)), semidense.poses(**options(running))
     sequences = [next(first).sequence for _ in range(5)], [next(second).sequence for _ in range(5)]
-    assert sequences[0] != [] and sequences[1] != []
+    for of_one in sequences:
+        assert of_one == sorted(set(of_one))
 
 
 def test_the_loop_ends_with_the_run_and_follows_to_the_next(rig: Rig) -> None:
@@ -176,11 +178,32 @@ def test_the_loop_ends_with_the_run_and_follows_to_the_next(rig: Rig) -> None:
     following = semidense.poses(**options(rig), follow=True)
     next(ending), next(following)
     rig.end(child)
-    assert len(list(ending)) >= 0
+    rest = [pose.sequence for pose in ending]
+    assert rest == sorted(set(rest))
     rig.output = rig.folder / "second"
     rig.live()
-    first = child.pid
-    until(lambda: next(following).sequence < 20 and first)
+    highest = 0
+
+    def has_begun_anew() -> bool:
+        nonlocal highest
+        sequence = next(following).sequence
+        is_before, highest = sequence < highest, max(highest, sequence)
+        return is_before
+
+    until(has_begun_anew)
+
+
+def test_a_read_without_a_timeout_notices_the_end_of_the_run(rig: Rig) -> None:
+    child = rig.live()
+    reader = Reader(Pose, **options(rig))
+    until(lambda: bool(reader.read()))
+    rig.end(child)
+
+    def has_ended() -> bool:
+        reader.read()
+        return not reader.is_open
+
+    until(has_ended)
 
 
 def test_ctrl_c_ends_the_command_line(running: Rig) -> None:

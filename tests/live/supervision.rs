@@ -10,7 +10,9 @@ use std::process::Child;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use crate::support::{Ended, Rig, WATCH_DOG, end, finish, signal, small_camera, until, with_mount};
+use crate::support::{
+    Ended, Rig, WATCH_DOG, end, finish, journal_of, signal, small_camera, until, with_mount,
+};
 use rustix::fs::{Mode, OFlags, fcntl_getfl, fcntl_setfl};
 use rustix::process::{Pid, Signal, kill_process};
 use semidense::service::peers::Peer;
@@ -188,11 +190,13 @@ fn ends_with_results(ending: Signal) {
         command.args(["--set", &format!("simulator.{setting}")]);
     }
     let replay = command.spawn().unwrap();
-    // Nothing reports that frames are done; a signal too early ends it without results and by another code path.
-    std::thread::sleep(Duration::from_secs(3));
+    // A signal before the first pose ends it without results and by another code path.
+    journal_of(&output, 60);
     signal(&replay, ending);
     let ended = end(replay);
     assert_eq!(ended.status.code(), Some(130), "{ending:?}: {}", ended.stderr);
+    let poses = fs::read_to_string(output.join("trajectory.txt")).unwrap();
+    assert!(poses.lines().filter(|line| !line.starts_with('#')).count() > 20, "{ending:?}");
 }
 
 /// A full pipe, and its reader, which does not read.
