@@ -1,10 +1,13 @@
 //! `semidense recover`: writes the results of a killed run from its journal.
 
 use std::error::Error;
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::time::SystemTime;
 
 use clap::Args;
+use serde_json::Value;
 
 use crate::capture::opening::open;
 use crate::capture::source::{FrameSource, FrameStamp};
@@ -55,7 +58,10 @@ pub fn run(config: &Config, arguments: &RecoverArguments) -> CommandResult {
     let recovered = Recovered::read(&found.folder)?;
     let output = arguments.output.clone().unwrap_or_else(|| found.output().to_owned());
     let output = std::path::absolute(output)?;
-    if arguments.output.is_none() && has_set_since(&output, recovered.start.began()) {
+    if arguments.output.is_none()
+        && has_set_since(&output, recovered.start.began())
+        && !holds_recovery(&output, recovered.ended)
+    {
         return Err(format!(
             "{} holds results of a later run: choose another folder with --output",
             output.display()
@@ -142,6 +148,13 @@ fn depth_warning(map: &Map, config: &Config, journal: &Path) -> Option<String> {
     (missing > 0).then(|| {
         format!("depth of {missing} of {all} keyframes is missing: {why}; trajectory and keyframe poses are not affected")
     })
+}
+
+/// Whether the results in a folder were recovered from the journal of the run that ended then.
+fn holds_recovery(output: &Path, ended: SystemTime) -> bool {
+    let text = fs::read_to_string(output.join("summary.json")).unwrap_or_default();
+    let summary: Value = serde_json::from_str(&text).unwrap_or_default();
+    summary["recovered_run_end"] == utc_text(ended).as_str()
 }
 
 /// The journal to recover: the newest one of the folder, or of all.

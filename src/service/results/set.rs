@@ -27,10 +27,11 @@ const FILES: [(&str, &str); 7] = [
 /// Files of sets on request, likewise.
 const ON_REQUEST: [(&str, &str); 2] =
     [("map.pcd", pcd::BEGINNING), ("points-full.ply", full_points::BEGINNING)];
-/// Beginnings of the files of earlier versions, which count as ours too.
-const EARLIER: [(&str, &str); 2] = [
+/// Beginnings of the files of earlier versions and of `map export`, which count as ours too.
+const EARLIER: [(&str, &str); 3] = [
     ("trajectory.txt", "# world_from_camera of every tracked frame"),
     ("keyframes.txt", "# world_from_keyframe; lengths in the keyframe"),
+    ("keyframes.txt", "# map_from_keyframe of every keyframe"),
 ];
 /// The file that is moved up first: while it is still aside, the files of the previous set are in place.
 const FIRST: &str = FILES[0].0;
@@ -140,8 +141,12 @@ pub fn has_set_since(output: &Path, time: SystemTime) -> bool {
 }
 
 fn begins_as_earlier(path: &Path, name: &str) -> io::Result<bool> {
-    let earlier = EARLIER.iter().find(|(of, _)| *of == name);
-    earlier.map_or(Ok(false), |(_, beginning)| begins_with(path, beginning))
+    for (_, beginning) in EARLIER.iter().filter(|(of, _)| *of == name) {
+        if begins_with(path, beginning)? {
+            return Ok(true);
+        }
+    }
+    Ok(false)
 }
 
 fn begins_with(path: &Path, beginning: &str) -> io::Result<bool> {
