@@ -199,7 +199,8 @@ impl Reader {
 
     /// Whether a topic has woken the reader.
     fn take_wakes(&self) -> Result<bool, Failure> {
-        let woken = self.events().fold(false, |woken, events| events.take() || woken);
+        // Each of them, whichever has woken.
+        let woken = self.events().filter(|events| events.take()).count() > 0;
         if is_readable(self.heartbeat.as_fd()) {
             let mut count = [0; 8];
             // The number of missed beats does not matter.

@@ -84,7 +84,15 @@ impl Manager {
             self.child.try_wait().unwrap()
         });
         self.listen();
-        self.heard
+        std::mem::take(&mut self.heard)
+    }
+}
+
+impl Drop for Manager {
+    fn drop(&mut self) {
+        // Of a test that fails.
+        drop(self.child.kill());
+        drop(self.child.wait());
     }
 }
 
