@@ -11,6 +11,8 @@ use crate::capture::source_error::SourceError;
 use crate::capture::source_name::SourceName;
 use crate::capture::v4l::params::CameraParams;
 use crate::capture::{bag, euroc, image_folder, stream, tum, v4l};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::two_frame::MIN_SIDE_PX;
 
 /// Settings of sources.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -68,6 +70,18 @@ pub fn open(
         SourceName::Stream(path) => Box::new(stream::open_socket(path, rig, stall_s)?),
         SourceName::Ros2(topic) => Box::new(stream::open_ros2(topic, rig, stall_s)?),
     })
+}
+
+/// Refuses a source whose images are too small to start a map on.
+pub fn check_size(name: &str, intrinsics: &Intrinsics) -> Result<(), SourceError> {
+    let Intrinsics { width, height, .. } = *intrinsics;
+    if width.min(height) >= MIN_SIDE_PX {
+        return Ok(());
+    }
+    let problem = format!(
+        "its images have {width}x{height} pixels, and tracking needs {MIN_SIDE_PX} to each side; enlarge them"
+    );
+    Err(SourceError::Name { name: name.to_owned(), problem })
 }
 
 /// For a folder without the layout that its source names, returns the source by the layout that it has.

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use crate::capture::opening::{open, rig_remarks};
+use crate::capture::opening::{check_size, open, rig_remarks};
 use crate::capture::source::{Arrival, FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
 use crate::capture::source_name::SourceName;
@@ -127,6 +127,7 @@ impl<'a> Shell<'a> {
         if !intrinsics.is_valid() {
             return Err(RunError::Intrinsics(options.source.clone()));
         }
+        check_size(&options.source.to_string(), &intrinsics)?;
         let place = Place::new(&config.instance, &config.root)?;
         let claim = place.claim("capture")?;
         place.check_shared_memory(shared_memory_bytes(&intrinsics, Some("capture")))?;

@@ -25,6 +25,7 @@ use crate::service::results::ResultsParams;
 use crate::service::schedule::{Background, SchedulingParams};
 use crate::slam::image::noise::ImageNoise;
 use crate::slam::mapper::MapperParams;
+use crate::slam::mapper::observation::DepthFilter;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::tracker::TrackerParams;
 
@@ -296,6 +297,7 @@ impl Config {
         tracking.reference.selection.noise = self.noise;
         mapping.matching.noise = self.noise;
         mapping.two_frame.fit.noise = self.noise;
+        self.results.has_spread_points = mapping.depth_filter == DepthFilter::Interval;
     }
 
     /// Checks every value.

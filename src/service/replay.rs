@@ -9,6 +9,7 @@ use std::time::Instant;
 
 use clap::ValueEnum;
 
+use crate::capture::opening::check_size;
 use crate::capture::source::{FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
 use crate::service::adjustments::{Adjustments, Entry};
@@ -238,6 +239,7 @@ impl<'a> Replay<'a> {
         if !intrinsics.is_valid() {
             return Err(ReplayError::Intrinsics(source_name.to_owned()));
         }
+        check_size(source_name, &intrinsics)?;
         let ground_truth = source.ground_truth().to_vec();
         let given = config.poses == PoseOrigin::GroundTruth;
         if given && ground_truth.is_empty() {

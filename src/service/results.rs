@@ -76,6 +76,9 @@ pub struct ResultsParams {
     pub full_points: bool,
     /// Transform fitted before positions are compared with the ground truth: `sim3`, `se3` or `none`.
     pub alignment: TrajectoryAlignment,
+    /// Whether keyframes hold the spread points of the interval filter: from `mapping.depth_filter`.
+    #[serde(skip)]
+    pub has_spread_points: bool,
 }
 
 impl Default for ResultsParams {
@@ -86,6 +89,7 @@ impl Default for ResultsParams {
             pcd: false,
             full_points: false,
             alignment: TrajectoryAlignment::Sim3,
+            has_spread_points: false,
         }
     }
 }
@@ -98,11 +102,12 @@ impl ResultsParams {
 
     /// Parameters for fusing keyframes into one surface.
     pub fn fusion(&self) -> FusionParams {
-        FusionParams {
+        let params = FusionParams {
             resolution: self.map_resolution,
             max_relative_std_dev: self.max_relative_std_dev,
             ..FusionParams::default()
-        }
+        };
+        if self.has_spread_points { params.of_spread_points() } else { params }
     }
 }
 

@@ -137,12 +137,15 @@ pub struct TwoFrameInitializer {
     mismatches: u32,
 }
 
+/// Shortest side of an image that a map can start on, pixels.
+pub const MIN_SIDE_PX: usize = 32;
+
 impl TwoFrameInitializer {
     /// An initialiser for images of `intrinsics`, without a first frame.
     pub fn new(intrinsics: Intrinsics, params: TwoFrameParams) -> Result<Self, ParameterError> {
         params.validate()?;
-        check_range("image width", intrinsics.width, 32..=8192)?;
-        check_range("image height", intrinsics.height, 32..=8192)?;
+        check_range("image width", intrinsics.width, MIN_SIDE_PX..=8192)?;
+        check_range("image height", intrinsics.height, MIN_SIDE_PX..=8192)?;
         let num_levels = num_levels(&intrinsics);
         let intrinsics: Vec<_> = (0..num_levels).map(|l| intrinsics.at_level(l)).collect();
         let state = State::at_rest(0);

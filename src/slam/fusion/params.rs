@@ -34,6 +34,13 @@ pub struct FusionParams {
     pub min_company: usize,
 }
 
+impl FusionParams {
+    /// For the spread points of the interval filter, of which a square around one holds few or none.
+    pub fn of_spread_points(self) -> Self {
+        Self { min_support: 0, support_ratio: 0.0, min_company: 0, ..self }
+    }
+}
+
 impl Default for FusionParams {
     fn default() -> Self {
         Self {
