@@ -176,13 +176,14 @@ def test_the_loop_ends_with_the_run_and_follows_to_the_next(rig: Rig) -> None:
     child = rig.live()
     ending = semidense.poses(**options(rig))
     following = semidense.poses(**options(rig), follow=True)
-    next(ending), next(following)
+    next(ending)
+    # Two seconds: the next run is joined sooner after its start.
+    highest = next(pose.sequence for pose in following if pose.sequence >= 60)
     rig.end(child)
     rest = [pose.sequence for pose in ending]
     assert rest == sorted(set(rest))
     rig.output = rig.folder / "second"
     rig.live()
-    highest = 0
 
     def has_begun_anew() -> bool:
         nonlocal highest
