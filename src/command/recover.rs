@@ -19,7 +19,7 @@ use crate::command::print::note;
 use crate::command::{CommandResult, NOTHING_TRACKED};
 use crate::service::config::Config;
 use crate::service::journal::Journal;
-use crate::service::journal::folder::{Unfinished, unfinished};
+use crate::service::journal::folder::{LOG, Unfinished, unfinished};
 use crate::service::journal::log::RunStart;
 use crate::service::journal::recovered::Recovered;
 use crate::service::recording::RecordParts;
@@ -166,12 +166,10 @@ fn find(place: &Place, folder: Option<&Path>) -> Result<Unfinished, Box<dyn Erro
             }
             let wanted = folder.canonicalize()?;
             // The folder of the run, or its journal.
-            let around = wanted.parent().map_or_else(Vec::new, |parent| unfinished(None, parent));
-            let all = unfinished(None, folder).into_iter().chain(around);
-            let mut found: Vec<Unfinished> =
-                all.filter(|f| f.output() == wanted || f.folder == wanted).collect();
-            found.dedup_by(|one, other| one.folder == other.folder);
-            found
+            let is_journal = wanted.join(LOG).is_file();
+            let output = wanted.parent().filter(|_| is_journal).unwrap_or(&wanted);
+            let all = unfinished(None, output).into_iter();
+            all.filter(|f| f.output() == wanted || f.folder == wanted).collect()
         }
         None => unfinished(Some(place), Path::new(PARENT)),
     };

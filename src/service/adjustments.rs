@@ -90,8 +90,6 @@ pub struct Adjustments {
     /// Frames so far, and the sequence of the last.
     frames: u64,
     sequence: u64,
-    /// Whether no frame follows.
-    is_over: bool,
     records: Vec<AdjustmentRecord>,
     searches: Vec<SearchRecord>,
     failure: Option<String>,
@@ -111,7 +109,6 @@ impl Adjustments {
             in_flight: None,
             frames: 0,
             sequence: 0,
-            is_over: false,
             records: Vec::new(),
             searches: Vec::new(),
             failure: None,
@@ -171,9 +168,8 @@ impl Adjustments {
         let left =
             || deadline.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
         let (_, mut outcome) = self.take_in(mapper, left());
-        self.is_over = true;
         while !left().is_zero() {
-            self.begin_with(mapper, Mapper::begin_last_search);
+            self.begin_with(mapper, true, Mapper::begin_last_search);
             let (fate, closed) = self.take_in(mapper, left());
             outcome = merged_outcome(outcome, closed);
             // One that cannot enter would be solved again and again.
@@ -181,7 +177,7 @@ impl Adjustments {
                 break;
             }
         }
-        self.begin_with(mapper, Mapper::begin_last_adjustment);
+        self.begin_with(mapper, true, Mapper::begin_last_adjustment);
         outcome = merged_outcome(outcome, self.apply_within(mapper, left()));
         while !left().is_zero() && mapper.refine_depth() {
             outcome.graph_changed = true;
@@ -199,12 +195,13 @@ impl Adjustments {
     fn begin(&mut self, mapper: &mut Mapper) {
         // In lockstep and replay depth is refined after the last frame, with the final poses.
         let may_refine = self.entry == Entry::WhenReady;
-        self.begin_with(mapper, |mapper| mapper.begin_adjustment(may_refine));
+        self.begin_with(mapper, false, |mapper| mapper.begin_adjustment(may_refine));
     }
 
     fn begin_with(
         &mut self,
         mapper: &mut Mapper,
+        is_last: bool,
         begin: impl FnOnce(&mut Mapper) -> Option<Box<Window>>,
     ) {
         let (None, Some(thread)) = (self.in_flight, &self.thread) else { return };
@@ -214,7 +211,7 @@ impl Adjustments {
             epoch: mapper.keyframe().map_or(0, |keyframe| keyframe.epoch),
             map_revision: mapper.map().revision,
             newest: newest(mapper),
-            is_last: self.is_over,
+            is_last,
             is_orphan: false,
         });
         thread.hand_over(window);

@@ -124,17 +124,17 @@ impl Odometry {
 
     /// Estimates all keyframes once more and refines their depth, after the last frame. More frames may follow.
     pub fn finish(&mut self) {
-        self.end_estimate();
+        self.end_estimate(false);
         while let Some(window) = self.mapper.begin_last_search() {
             self.estimate(window);
             // One that cannot enter would be solved again and again.
-            if !self.end_last_estimate() {
+            if self.end_estimate(true).is_none() {
                 break;
             }
         }
         if let Some(window) = self.mapper.begin_last_adjustment() {
             self.estimate(window);
-            self.end_last_estimate();
+            self.end_estimate(true);
         }
         while self.mapper.refine_depth() {}
         self.mapper.store_confirmed_points();
@@ -175,38 +175,25 @@ impl Odometry {
 
     fn apply_estimate(&mut self) -> StepOutcome {
         match self.estimate.as_ref().is_some_and(|estimate| self.frames >= estimate.due) {
-            true => self.end_estimate(),
+            true => self.end_estimate(false).unwrap_or_default(),
             false => StepOutcome::default(),
         }
     }
 
-    /// Applies the estimate, unless the map it was made from has changed or is rejected.
-    fn end_estimate(&mut self) -> StepOutcome {
-        let Some(estimate) = self.estimate.take() else { return StepOutcome::default() };
-        let is_established =
-            self.mapper.keyframe().is_some_and(|active| active.map_state == MapState::Established);
-        if is_established && self.is_of_this_map(&estimate) {
-            return self.mapper.end_adjustment(estimate.window);
+    /// Applies the estimate, unless the map it was made from has changed, or is rejected while frames follow; `None`
+    /// where it was dropped.
+    fn end_estimate(&mut self, is_last: bool) -> Option<StepOutcome> {
+        let estimate = self.estimate.take()?;
+        let is_same_map = self.mapper.keyframe().is_some_and(|active| {
+            active.epoch == estimate.epoch
+                && (is_last || active.map_state == MapState::Established)
+                && self.mapper.map().revision == estimate.map_revision
+        });
+        if is_same_map {
+            return Some(self.mapper.end_adjustment(estimate.window));
         }
         self.mapper.drop_adjustment(estimate.window);
-        StepOutcome::default()
-    }
-
-    /// Applies an estimate made after the last frame, whatever became of the active keyframe; false if it was dropped.
-    fn end_last_estimate(&mut self) -> bool {
-        let Some(estimate) = self.estimate.take() else { return false };
-        let is_applied = self.is_of_this_map(&estimate);
-        if is_applied {
-            self.mapper.end_adjustment(estimate.window);
-        } else {
-            self.mapper.drop_adjustment(estimate.window);
-        }
-        is_applied
-    }
-
-    fn is_of_this_map(&self, estimate: &Estimate) -> bool {
-        self.mapper.map().revision == estimate.map_revision
-            && self.mapper.keyframe().is_some_and(|active| active.epoch == estimate.epoch)
+        None
     }
 
     /// Hands the mapper's keyframe to the tracker, in the memory of the previous one.

@@ -2,7 +2,6 @@
 //! the claim of a process to be the only one of its kind.
 
 use std::fs::{self, DirBuilder, File};
-use std::io::Read;
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -24,6 +23,9 @@ pub(in crate::wire) const JOIN_LOCK: &str = ".join.lock";
 
 /// The processes of an instance, by the names under which they claim it.
 pub(in crate::wire) const MEMBERS: [&str; 3] = ["capture", "tracker", "mapper"];
+
+/// The process that starts them in a run, by the name of its claim.
+pub(in crate::wire) const SUPERVISOR: &str = "supervisor";
 
 /// Suffix of the mapper's checkpoint, after the name of the instance.
 pub(in crate::wire) const CHECKPOINT_SUFFIX: &str = ".checkpoint";
@@ -199,14 +201,9 @@ impl Place {
 
     /// Process id of a running member of the instance, from its claim.
     pub(in crate::wire) fn running(&self) -> Option<String> {
-        MEMBERS.iter().find_map(|process| {
-            let path = self.claim_path_of(&self.instance, process);
-            let mut file = File::open(path).ok()?;
-            rustix::fs::flock(&file, FlockOperation::NonBlockingLockShared).err()?;
-            let mut holder = String::new();
-            file.read_to_string(&mut holder).ok()?;
-            Some(holder.trim().to_owned())
-        })
+        let process = MEMBERS.iter().find(|process| self.is_running(process))?;
+        let holder = fs::read_to_string(self.claim_path_of(&self.instance, process)).ok()?;
+        Some(holder.trim().to_owned())
     }
 }
 

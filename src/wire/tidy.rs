@@ -13,6 +13,7 @@ use rustix::fs::FlockOperation;
 use crate::wire::lock_file::{is_held, lock_named};
 use crate::wire::place::{
     CHECKPOINT_SUFFIX, CLAIM_SUFFIX, JOIN_LOCK, LOADED_MAP_SUFFIX, MEMBERS, POSITION_SUFFIX, Place,
+    SUPERVISOR,
 };
 
 /// Longest wait before tidying up; the next process that leaves can do it as well.
@@ -90,8 +91,9 @@ impl Place {
     /// Removes the files kept for successors once the last process of this instance has left in order, while other
     /// instances go on. Only while no process can join.
     fn remove_left_files(&self) {
-        // A killed process leaves its claim.
-        let is_left = MEMBERS.iter().all(|of| !self.claim_path_of(&self.instance, of).exists());
+        // A killed process leaves its claim, and a supervisor starts its processes again.
+        let mut owners = MEMBERS.iter().chain([&SUPERVISOR]);
+        let is_left = owners.all(|of| !self.claim_path_of(&self.instance, of).exists());
         if is_left {
             self.kept_files().for_each(|path| drop(fs::remove_file(path)));
         }
@@ -315,6 +317,10 @@ mod tests {
         place.tidy();
         assert!(place.checkpoint_path().exists(), "a mapper restarted alone continues");
         drop(tracker);
+        let supervisor = place.claim("supervisor").unwrap();
+        place.tidy();
+        assert!(place.checkpoint_path().exists(), "its processes are started again");
+        drop(supervisor);
         place.tidy();
         assert!(!place.checkpoint_path().exists() && other.exists() && node.exists());
     }

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use crate::support::{Rig, finish};
+use crate::support::{Rig, finish, small_camera};
 use serde_json::Value;
 
 const WIDTH: usize = 160;
@@ -141,4 +141,18 @@ fn a_machine_that_is_too_slow_is_reported() {
     let source = record_sized(&rig.folder().join("flicker"), FRAMES, size, flicker);
     let command = rig.command(&["run", "--live", "--source", &format!("loop:200:1000:{source}")]);
     assert_untracked(command, &rig.output(), "the machine is too slow");
+}
+
+#[test]
+fn a_closed_pipe_does_not_hide_that_nothing_was_tracked() {
+    let rig = Rig::new();
+    let mut command = rig.command(&["replay", "sim", "--frames", "3", "--output"]);
+    command.arg(rig.output());
+    for setting in small_camera(3) {
+        command.args(["--set", &format!("simulator.{setting}")]);
+    }
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let status = command.stdout(writer).stderr(std::process::Stdio::null()).status().unwrap();
+    assert_eq!(status.code(), Some(NOTHING_TRACKED));
 }

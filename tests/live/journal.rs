@@ -161,6 +161,12 @@ fn a_killed_replay_is_recovered() {
     // A run that died during a write.
     let log = fs::File::options().append(true).open(journal.join("log")).unwrap();
     std::io::Write::write_all(&mut &log, &[77; 300]).unwrap();
+    // By the name of the journal, which is kept, as often as one likes.
+    for _ in 0..2 {
+        let kept = finish(rig.command(&["recover", journal.to_str().unwrap(), "--keep"]));
+        assert!(kept.status.success() && journal.exists(), "{}", kept.stderr);
+        assert!(!kept.stderr.contains("semidense recover"), "it is the only one: {}", kept.stderr);
+    }
     assert_recovered(&rig, &output);
 }
 

@@ -203,3 +203,24 @@ fn the_pause_before_a_restart_grows_and_is_reset() {
     file.set_modified(std::time::UNIX_EPOCH).unwrap();
     assert_eq!(after("signal").as_deref(), Some("0"));
 }
+
+#[test]
+fn the_package_of_the_bridge_belongs_to_this_version_and_handles_all_its_units() {
+    let manifest = fs::read_to_string(root().join("bridge/Cargo.toml")).unwrap();
+    let depends = format!("semidense (= {}-1)", env!("CARGO_PKG_VERSION"));
+    assert!(manifest.contains(&depends), "bridge/Cargo.toml does not depend on {depends}");
+    let units = fs::read_dir(root().join("deploy/systemd/bridge")).unwrap().map(|entry| {
+        let name = entry.unwrap().file_name().into_string().unwrap();
+        name.strip_suffix("@.service").unwrap().to_owned()
+    });
+    let units: Vec<String> = units.collect();
+    assert!(units.len() >= 5, "{units:?}");
+    for (script, ending) in [("prerm", "@*"), ("postinst", "@*"), ("postrm", "")] {
+        let text = fs::read_to_string(root().join("deploy/debian/bridge").join(script)).unwrap();
+        let words: Vec<&str> = text.split([' ', '\n', ';', '\'']).collect();
+        for unit in &units {
+            let name = format!("{unit}{ending}");
+            assert!(words.contains(&name.as_str()), "{script} leaves out {name}");
+        }
+    }
+}

@@ -92,7 +92,7 @@ impl Walk {
     }
 }
 
-pub(in crate::service) fn start(entry: Entry, optimise: Optimise) -> Adjustments {
+pub(super) fn start(entry: Entry, optimise: Optimise) -> Adjustments {
     Adjustments::start_with(entry, Background::Other, optimise).unwrap()
 }
 

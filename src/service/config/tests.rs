@@ -261,3 +261,14 @@ fn comment_of(text: &str, key: &str) -> String {
     let words: Vec<&str> = above.map(|line| line.trim_start_matches("# ")).collect();
     words.into_iter().rev().collect::<Vec<_>>().join(" ")
 }
+
+#[test]
+fn spread_points_are_fused_without_support_around_them() {
+    let params = |filter: &str| {
+        let config = set(&[&format!("mapping.depth_filter={filter}")]).unwrap();
+        let fusion = config.results.fusion();
+        (fusion.min_support, fusion.min_company)
+    };
+    assert_eq!(params("interval"), (0, 0));
+    assert!(params("gaussian").0 > 0 && params("both").1 > 0);
+}

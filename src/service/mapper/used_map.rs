@@ -18,9 +18,6 @@ use crate::wire::place::Place;
 /// Largest file, bytes: two paths of maximal length, every byte of them escaped.
 const MAX_BYTES: u64 = 1 << 16;
 
-/// Stands for the folder in a note that cannot be read.
-const UNKNOWN: &str = "?";
-
 /// The map on disk that a mapper uses.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -42,27 +39,28 @@ pub(super) fn open_checkpoint(
     let (path, note) = (place.checkpoint_path(), place.loaded_map_path());
     let (mut kept, mut left) = Kept::open(&path);
     let mut used = UsedMap::of(configured);
-    // A note that cannot be read may be that of a mapper with any map.
-    let before = UsedMap::read(&note).unwrap_or_else(|error| {
-        tracing::warn!("{}: {error}", note.display());
-        Some(UsedMap { configured: UNKNOWN.to_owned(), ..UsedMap::default() })
-    });
-    match before {
-        Some(before) if before.configured == configured.folder => used = before,
-        Some(before) => {
-            if let Some(map) = &left {
-                tracing::warn!("{}", left_out(&before.configured, &configured.folder));
-                used.numbering = Numbering::above_map(map);
-            }
-            if let Some(mut old) = kept.take() {
-                old.remove_on_drop();
-                drop(old);
-                kept = Kept::open(&path).0;
-            }
-            // In a map on disk the numbering continues them.
-            left = left.filter(|_| configured.folder.is_empty()).map(|map| numbers_of(&map));
+    let other = match UsedMap::read(&note) {
+        Ok(None) => None,
+        Ok(Some(before)) if before.configured == configured.folder => {
+            used = before;
+            None
         }
-        None => {}
+        Ok(Some(before)) => Some(started_otherwise(&before.configured, &configured.folder)),
+        // It may be that of a mapper with any map.
+        Err(error) => Some(format!("{}: {error}", note.display())),
+    };
+    if let Some(other) = other {
+        if let Some(map) = &left {
+            tracing::warn!("{other}: what the mapper before this one left is not continued");
+            used.numbering = Numbering::above_map(map);
+        }
+        if let Some(mut old) = kept.take() {
+            old.remove_on_drop();
+            drop(old);
+            kept = Kept::open(&path).0;
+        }
+        // In a map on disk the numbering continues them.
+        left = left.filter(|_| configured.folder.is_empty()).map(|map| numbers_of(&map));
     }
     if let Err(error) = used.write(&note) {
         tracing::warn!("{}: {error}; a restarted mapper uses the configured map", note.display());
@@ -70,17 +68,12 @@ pub(super) fn open_checkpoint(
     (kept, left, used)
 }
 
-fn left_out(before: &str, now: &str) -> String {
+fn started_otherwise(before: &str, now: &str) -> String {
     let name = |folder: &str| match folder {
         "" => "without a map".to_owned(),
-        UNKNOWN => "with an unknown map".to_owned(),
         folder => format!("with the map {folder}"),
     };
-    format!(
-        "the mapper before this one was started {}, this one is started {}: what it left is not continued",
-        name(before),
-        name(now)
-    )
+    format!("the mapper before this one was started {}, this one {}", name(before), name(now))
 }
 
 /// A map without depth: only its numbers can be continued.

@@ -240,7 +240,7 @@ impl Tracker {
         }
         let mut view = self.turning.view.take()?;
         let lost = self.restore_memory(before);
-        let step = since_view.clamp(MIN_SECONDS, MAX_SECONDS);
+        let step = since_view.max(MIN_SECONDS);
         view.place_view(&place.world_from_view, TIGHTNESS * place.speed * step);
         let mut next = ViewPose { since_secs: place.since_secs + step, ..place };
         let distance_variance = place.distance_variance(next.since_secs);
@@ -258,7 +258,7 @@ impl Tracker {
         let is_cut_short = alignment.ending == Ending::OutOfBudget;
         let Some((estimate, covariance)) = estimate else {
             self.memory = lost;
-            if is_cut_short && (0.0..MAX_SECONDS).contains(&since_view) {
+            if is_cut_short && since_view >= 0.0 {
                 // This frame tells nothing: the view waits for the next one, of which the same motion is expected.
                 self.memory.motion = before.motion.clone();
             } else {

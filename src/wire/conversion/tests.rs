@@ -217,16 +217,16 @@ proptest! {
     #[test]
     fn no_pose_message_panics_or_brings_in_a_broken_number(
         bits in prop::array::uniform32(any::<u64>()), codes in prop::array::uniform4(0_u32..6),
-        is_placed in any::<bool>(), is_even in any::<bool>(),
+        has_transform in any::<bool>(), has_covariances in any::<bool>(),
     ) {
         let mut message = pose_message(&pose(), &PoseTiming::default());
         let number = |i: usize| f64::from_bits(bits[i]);
         (message.state, message.reason) = (codes[0], codes[1]);
         message.proposes_keyframe = codes[2];
-        if !is_placed {
+        if !has_transform {
             message.world_from_camera = std::array::from_fn(number);
         }
-        if !is_even {
+        if !has_covariances {
             message.covariance = std::array::from_fn(|i| number(i + 7));
             message.map_covariance = std::array::from_fn(|i| number(i + 5));
             message.alignment_covariance = std::array::from_fn(|i| number(i + 8));

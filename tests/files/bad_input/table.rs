@@ -121,6 +121,22 @@ const SOURCES: &[Row] = &[
 
 const IMAGES: &[Row] = &[
     row(
+        "images too small to start a map on",
+        "",
+        "semidense run sim --set simulator.width=40 --set simulator.height=24",
+        1,
+        &[
+            "source `sim`: its images have 40x24 pixels, and tracking needs 32 to each side; enlarge them",
+        ],
+    ),
+    row(
+        "the same in a replay",
+        "",
+        "semidense replay sim --set simulator.width=40 --set simulator.height=24",
+        1,
+        &["source `sim`: its images have 40x24 pixels, and tracking needs 32 to each side"],
+    ),
+    row(
         "one truncated image",
         "halve $(image 3)",
         "semidense replay recording --output out",
