@@ -31,12 +31,13 @@ const COLUMNS: [Column; 8] = [
     column("frames", 8, 2, ("/frames", 0), "handled since the process started"),
     column("rate", 6, 1, ("/rate_hz", 1), "frames per second"),
     column("drop", 5, 4, ("/dropped", 0), "skipped for a newer frame"),
-    column("late", 5, 3, ("/deadline_misses", 0), "finished after the deadline"),
+    column("late", 5, 3, ("/deadline_misses", 0), LATE_LEGEND),
     column("p50", 7, 5, ("/latency_ms/p50", 2), P50_LEGEND),
     column("p99", 7, 2, ("/latency_ms/p99", 2), "99th percentile of the same"),
     column("MiB", 5, 6, ("/peak_rss_mb", 0), "peak memory"),
     column("up", 7, 7, ("/uptime_secs", 0), "seconds since the process started"),
 ];
+const LATE_LEGEND: &str = "poses published after the deadline, which counts from their frame's arrival";
 const P50_LEGEND: &str =
     "median ms: capture from stamp to sending, tracker from stamp to pose, mapper per frame";
 

@@ -262,9 +262,9 @@ pub struct Summary {
     /// Latency of the poses.
     #[serde(flatten)]
     pub latency: LatencySummary,
-    /// Time allowed to the tracker for a frame.
+    /// Time from a frame's arrival in the tracker until its pose is due. Live only.
     pub deadline_ms: Option<f64>,
-    /// Frames published later than that.
+    /// Poses published later than that.
     pub deadline_misses: Option<u64>,
     /// Page faults of the tracker's frame loop after its first hundred frames.
     pub page_faults: Option<u64>,

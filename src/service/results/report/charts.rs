@@ -200,7 +200,7 @@ pub fn time_charts(record: &RunRecord) -> Vec<Chart> {
     let deadline = record.deadline_nanos.map(|n| n as f64 * 1e-6);
     let mut charts = Vec::new();
     for (times, samples, limit) in
-        [(&TRACKING, track, None), (&MAPPING_STEPS, map, None), (&LATENCY, latency, deadline)]
+        [(&TRACKING, track, deadline), (&MAPPING_STEPS, map, None), (&LATENCY, latency, None)]
     {
         if !samples.is_empty() {
             let line = vec![Series::new("", times.colour, Mark::Line, samples.clone())];
@@ -243,17 +243,22 @@ const LATENCY: Times = Times {
     meaning: "From a frame's stamp to the publication of its pose: how old a pose is when it can be used.",
 };
 
+const DISTRIBUTION_MEANING: &str =
+    "How many frames took how long; 95 % of them are left of p95. The last bar also has all longer ones.";
+const DEADLINE_MEANING: &str = "How many frames took how long; 95 % of them are left of p95. The last bar also has all longer ones. The \
+     deadline counts from a frame's arrival, as these times do; it is drawn where it lies in the range.";
+
 const ABOVE_MEANING: &str = "Path of the camera; keyframes are the frames that carry the map. With ground truth the \
                              estimate is aligned to it, and good means that the two lines cover each other.";
 const SIDE_MEANING: &str = "The same from the side, one length along both axes: how the camera rose and fell. Up is \
                             estimated from how it was held and from horizontal surfaces.";
 
-/// Distribution of the times of frames. The range ends at 1.5 times the 99th percentile or the limit, whichever is
-/// larger; larger times are counted in the last bar.
-fn histogram(times: &Times, samples: &[[f64; 2]], limit: Option<f64>) -> Chart {
+/// Distribution of the times of frames. The range ends at 1.5 times the 99th percentile; larger times are counted in the
+/// last bar. A deadline beyond the range is not drawn: to show it, the bars would have to shrink to one.
+fn histogram(times: &Times, samples: &[[f64; 2]], deadline: Option<f64>) -> Chart {
     let durations = samples.iter().map(|sample| sample[1]);
     let [p95, p99] = percentiles(durations.clone(), [0.95, 0.99]).unwrap_or_default();
-    let end = 1.5 * p99.max(limit.unwrap_or(0.0)).max(1e-3);
+    let end = 1.5 * p99.max(1e-3);
     let width = end / BARS as f64;
     let mut counts = [0u32; BARS];
     for time in durations {
@@ -264,11 +269,11 @@ fn histogram(times: &Times, samples: &[[f64; 2]], limit: Option<f64>) -> Chart {
         Series::new("", times.colour, Mark::Bars(width * 0.9), bars.collect()),
         Series::new("p95", ERROR, Mark::Rule, vec![[p95, 0.0]]),
     ];
-    let rule = |limit| Series::new("deadline", TRUTH, Mark::Rule, vec![[limit, 0.0]]);
-    series.extend(limit.map(rule));
+    let rule = |deadline| Series::new("deadline", TRUTH, Mark::Rule, vec![[deadline, 0.0]]);
+    series.extend(deadline.filter(|deadline| *deadline < end).map(rule));
     Chart {
         title: times.distribution,
-        meaning: "How many frames took how long; 95 % of them are left of p95. The last bar also has all longer ones.",
+        meaning: if deadline.is_some() { DEADLINE_MEANING } else { DISTRIBUTION_MEANING },
         x_label: "time [ms]".into(),
         y_label: "frames".into(),
         height: 230.0,
@@ -308,5 +313,27 @@ mod tests {
         }));
         let drawn: Vec<i64> = keyframe_poses(&record).iter().map(|pose| pose.nanos).collect();
         assert_eq!(drawn, [1, 2]);
+    }
+
+    #[test]
+    fn the_deadline_is_drawn_over_times_that_count_from_the_arrival() {
+        let mut record = RunRecord::empty(RunMode::Live, "x");
+        record.poses.extend((0..100).map(|sequence| RecordedPose {
+            estimate: PoseEstimate::unknown_at(sequence, 0),
+            latency_nanos: Some(30_000_000),
+            track_nanos: Some(3_000_000),
+            trace: None,
+            wake_nanos: None,
+        }));
+        let charts_with_deadline = |deadline_nanos, record: &mut RunRecord| -> Vec<&'static str> {
+            record.deadline_nanos = deadline_nanos;
+            let charts = time_charts(record);
+            let has_rule = |chart: &&Chart| chart.series.iter().any(|of| of.name == "deadline");
+            charts.iter().filter(has_rule).map(|chart| chart.title).collect()
+        };
+        let near = charts_with_deadline(Some(4_000_000), &mut record);
+        assert_eq!(near, ["Distribution of tracking time"]);
+        let far = charts_with_deadline(Some(16_000_000), &mut record);
+        assert_eq!((far, charts_with_deadline(None, &mut record)), (vec![], vec![]));
     }
 }

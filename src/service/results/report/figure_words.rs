@@ -146,7 +146,7 @@ pub(super) const RUN_WORDS: &[Words] = words! {
     lost_count: Tracking, Format::Count, "Losses", "How often tracking was lost. 0 is good.";
     frames_dropped: Tracking, Format::Count, "Frames dropped", "Frames that the tracker never saw because newer ones had arrived. 0 is good.";
     frames_skipped_by_mapper: Tracking, Format::Count, "Frames not mapped", "Frames with a pose that the mapper left out because newer ones had arrived. Their poses are not affected.";
-    deadline_misses: Tracking, Format::Count, "Deadline misses", "Frames published later than the tracker's deadline. 0 is good.";
+    deadline_misses: Tracking, Format::Count, "Deadline misses", "Poses published after the tracker's deadline, which counts from the frame's arrival. 0 is good.";
     initialization_secs: Tracking, Format::Unit("s"), "Time to the first pose", "From the first frame to the first whose pose is claimed.";
     untracked: Tracking, Format::Text, "Why nothing was tracked", "The most likely reason.";
     whitened_residual_median: Tracking, Format::Number, "Residual over its standard deviation", "Median over the tracked frames: 1 is as modelled; above 1.5 the calibration is doubtful.";
@@ -185,7 +185,7 @@ pub(super) const RUN_WORDS: &[Words] = words! {
     latency_histogram: Time, Format::Histogram, "Latencies", "How many frames were that late.";
     track_histogram: Time, Format::Histogram, "Times in the tracker", "How many frames took that long.";
     wake_histogram: Time, Format::Histogram, "Wake-up times", "How many frames waited that long.";
-    deadline_ms: Time, Format::Unit("ms"), "Deadline", "Time that the tracker was allowed for a frame.";
+    deadline_ms: Time, Format::Unit("ms"), "Deadline", "Time from a frame's arrival until its pose is due.";
     track_ms: Time, Format::Times, "Tracking a frame", "Time in the tracker. Good is well below the interval between frames.";
     pyramid_ms: Time, Format::Times, "Image pyramid", "Part of the tracking time: from the frame to the first iteration.";
     alignment_levels: Time, Format::Rows(LEVELS), "Alignment by pyramid level", "What the alignment of a frame costs on each level of the image pyramid.";
