@@ -19,12 +19,13 @@ use crate::service::map_folder::map_folder_error::MapFolderError;
 use crate::service::map_folder::reading::read_manifest;
 use crate::service::results::Results;
 use crate::service::results::calibration::calibration_warning;
+use crate::service::results::empty_map::empty_map_warning;
 use crate::service::results::mapping_load::mapping_warning;
 use crate::service::results::output_folder::OutputFolder;
 use crate::service::results::record::{EndOfRun, RunMode, RunRecord};
 use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::has_tracked_set;
-use crate::service::results::summary::Summary;
+use crate::service::results::summary::{PointCounts, Summary};
 use crate::service::results::summary_text::{recovery_text, refused_text, summary_text};
 use crate::slam::counted::counted;
 
@@ -116,7 +117,8 @@ impl Ending<'_> {
         })
     }
 
-    /// Prints the figures, and warnings about what the user can change.
+    /// Prints the figures, and warnings about what the user can change. If nothing was tracked, the reason is printed
+    /// later.
     fn print_summary(&self, summary: &Summary) -> Result<(), Box<dyn Error>> {
         print_as(self.json, summary, summary_text)?;
         if self.json {
@@ -128,10 +130,11 @@ impl Ending<'_> {
         let rejections = summary.map_rejections.as_ref().filter(|_| is_tracked);
         let num_rejections = rejections.map_or(0, Vec::len);
         let calibration = calibration_warning(summary.whitened_residual_median, num_rejections);
-        // If nothing was tracked, the reason is printed later.
-        let mapping =
-            mapping_warning(mode, skipped, frames_in).filter(|_| summary.untracked.is_none());
-        for warning in calibration.into_iter().chain(mapping) {
+        let mapping = mapping_warning(mode, skipped, frames_in);
+        let PointCounts { points, map_points, .. } = summary.point_counts;
+        let empty = empty_map_warning(points, map_points, self.config.results.map_resolution);
+        let of_tracked = mapping.into_iter().chain(empty).filter(|_| summary.untracked.is_none());
+        for warning in calibration.into_iter().chain(of_tracked) {
             note(&format!("warning: {warning}"));
         }
         Ok(())

@@ -18,6 +18,7 @@ use crate::service::map_folder::reading::{Loaded, load};
 use crate::service::map_folder::report::{MapReport, export};
 use crate::service::map_folder::session::check;
 use crate::service::peers::Peer;
+use crate::service::results::empty_map::empty_map_warning;
 use crate::service::results::output_folder::utc_text;
 use crate::slam::counted::counted;
 use crate::wire::command::{Command, CommandClient};
@@ -233,6 +234,9 @@ fn export_map(config: &Config, arguments: &ExportArguments) -> CommandResult {
     progress.finish();
     let (points, keyframes) =
         exported.map_err(|error| format!("{}: {error}", arguments.output.display()))?;
+    if let Some(warning) = empty_map_warning(report.points, points, params.map_resolution) {
+        note(&format!("warning: {warning}"));
+    }
     print(&format!(
         "{}: map.ply with {}, keyframes.txt with {} of epoch {epoch}\n",
         arguments.output.display(),

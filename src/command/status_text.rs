@@ -37,7 +37,8 @@ const COLUMNS: [Column; 8] = [
     column("MiB", 5, 6, ("/peak_rss_mb", 0), "peak memory"),
     column("up", 7, 7, ("/uptime_secs", 0), "seconds since the process started"),
 ];
-const LATE_LEGEND: &str = "poses published after the deadline, which counts from their frame's arrival";
+const LATE_LEGEND: &str =
+    "poses published after the deadline, which counts from their frame's arrival";
 const P50_LEGEND: &str =
     "median ms: capture from stamp to sending, tracker from stamp to pose, mapper per frame";
 

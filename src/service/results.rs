@@ -9,6 +9,7 @@ pub(crate) mod calibration;
 pub(crate) mod colour;
 pub(crate) mod debug_pictures;
 pub(crate) mod depth_maps;
+pub(crate) mod empty_map;
 pub(crate) mod full_points;
 pub(crate) mod joint;
 pub(crate) mod joint_points;

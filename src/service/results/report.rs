@@ -28,6 +28,7 @@ use rayon::prelude::*;
 
 use crate::service::results::Results;
 use crate::service::results::colour::Picture;
+use crate::service::results::empty_map::empty_map_warning;
 use crate::service::results::output_folder::utc_text;
 use crate::service::results::pictures::{
     RELATIVE_STD_DEV_RANGE, density_picture, inverse_depth_picture, variance_picture,
@@ -75,7 +76,7 @@ pub fn report(results: &Results<'_>) -> String {
         env!("CARGO_PKG_VERSION"),
         summary.frames_in,
         summary.recorded_secs,
-        notices(summary, &results.record.ended)
+        notices(results)
     );
     let normals = results.surface.iter().map(|point| point.normal);
     let up = up_direction(results.trajectory.iter(), normals);
@@ -100,9 +101,10 @@ pub fn report(results: &Results<'_>) -> String {
     page
 }
 
-/// What a reader must know first: that a run did not finish, or tracked nothing.
-fn notices(summary: &Summary, ended: &EndOfRun) -> String {
-    let end = match ended {
+/// What a reader must know first: that a run did not finish, tracked nothing, or has an empty map.
+fn notices(results: &Results<'_>) -> String {
+    let summary = &results.summary;
+    let end = match &results.record.ended {
         EndOfRun::Finished => None,
         EndOfRun::Interrupted => Some("Interrupted: these are the results up to then.".to_owned()),
         EndOfRun::Failed(cause) => {
@@ -116,8 +118,12 @@ fn notices(summary: &Summary, ended: &EndOfRun) -> String {
     };
     let untracked = summary.untracked.as_ref();
     let untracked = untracked.map(|why| format!("Nothing was tracked: {}.", escaped(why)));
+    let (points, resolution) = (summary.point_counts.points, results.params.map_resolution);
+    let empty = empty_map_warning(points, results.surface.len(), resolution);
+    let empty =
+        empty.filter(|_| untracked.is_none()).map(|why| format!("Note: {}.", escaped(&why)));
     let notice = |text: String| format!("<p class=\"notice\">{text}</p>");
-    end.into_iter().chain(untracked).map(notice).collect()
+    end.into_iter().chain(untracked).chain(empty).map(notice).collect()
 }
 
 /// Cost of a deadline; empty where no frame was realigned.

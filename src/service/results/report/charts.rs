@@ -243,8 +243,7 @@ const LATENCY: Times = Times {
     meaning: "From a frame's stamp to the publication of its pose: how old a pose is when it can be used.",
 };
 
-const DISTRIBUTION_MEANING: &str =
-    "How many frames took how long; 95 % of them are left of p95. The last bar also has all longer ones.";
+const DISTRIBUTION_MEANING: &str = "How many frames took how long; 95 % of them are left of p95. The last bar also has all longer ones.";
 const DEADLINE_MEANING: &str = "How many frames took how long; 95 % of them are left of p95. The last bar also has all longer ones. The \
      deadline counts from a frame's arrival, as these times do; it is drawn where it lies in the range.";
 
