@@ -190,7 +190,7 @@ impl Recording {
             deadline_nanos: is_live.then_some(deadline_nanos),
             deadline_misses: is_live.then_some(counters.deadline_misses),
             send_counts: is_live.then_some(counters.send_counts),
-            page_faults: (!is_replay).then_some(counters.page_faults),
+            page_faults: is_live.then_some(counters.page_faults),
             map_nanos: self.map_nanos,
             keyframe_step_nanos: self.keyframe_step_nanos,
             keyframe_nanos: self.keyframe_nanos,
@@ -239,6 +239,27 @@ mod tests {
         }
         estimate.covariance[20] = 1.0 / (1.0 + sequence as f64);
         pose_message(&estimate, &timing)
+    }
+
+    #[test]
+    fn only_a_live_run_has_a_deadline_and_page_faults_that_may_cost_it() {
+        let record = |mode| {
+            let parts = RecordParts {
+                mode,
+                source: "x".to_owned(),
+                map: Map::default(),
+                ground_truth: Vec::new(),
+                depth_scale: DepthScale::default(),
+                is_depth_from_sensor: false,
+                deadline_ms: 5.0,
+                counters: RunCounters { page_faults: 3, ..RunCounters::default() },
+            };
+            let record = Recording::default().into_record(parts);
+            (record.page_faults, record.deadline_nanos)
+        };
+        assert_eq!(record(RunMode::Live), (Some(3), Some(5_000_000)));
+        assert_eq!(record(RunMode::Lockstep), (None, None));
+        assert_eq!(record(RunMode::Replay), (None, None));
     }
 
     #[test]

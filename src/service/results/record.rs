@@ -135,7 +135,7 @@ pub struct RunRecord {
     pub deadline_misses: Option<u64>,
     /// How long after their stamp capture sent frames; `None` except for live runs.
     pub send_counts: Option<TimeCounts>,
-    /// Page faults of the tracker's frame loop since it was warm; `None` in one process.
+    /// Page faults of the tracker's frame loop since it was warm; `None` except for live runs.
     pub page_faults: Option<u64>,
     /// Time in the mapper, one per frame it mapped.
     pub map_nanos: Vec<u64>,

@@ -266,7 +266,8 @@ pub struct Summary {
     pub deadline_ms: Option<f64>,
     /// Poses published later than that.
     pub deadline_misses: Option<u64>,
-    /// Page faults of the tracker's frame loop after its first hundred frames.
+    /// Page faults of the tracker's frame loop after its first hundred frames. Live only: without a deadline
+    /// they cost nothing.
     pub page_faults: Option<u64>,
     /// Processes that were restarted.
     pub restarts: u64,
