@@ -64,7 +64,7 @@ pub struct TrajectorySummary {
     pub rpe_rotation_deg_1s: Option<f64>,
     /// Length of the true path between matched poses.
     pub path_length_m: Option<f64>,
-    /// Largest over smallest scale of consecutive windows of 100 frames.
+    /// Scale drift: largest over smallest scale of consecutive windows of 100 frames.
     pub window_scale_ratio: Option<f64>,
     /// Median position error of windows of 30 frames, each aligned separately.
     pub window_error_m: Option<f64>,
@@ -138,7 +138,7 @@ pub struct DepthSummary {
     pub depth_modes: Option<[f64; 3]>,
     /// The same over the standard deviation that each keyframe claims: 0.67 is right, more is overconfident.
     pub depth_modes_whitened: Option<[f64; 3]>,
-    /// Largest over smallest map unit of the keyframes, according to their depth: 1 where the scale does not drift.
+    /// Spread of the keyframes' depth scales: largest over smallest map unit of their depth, 1 where they agree.
     #[serde(default)]
     pub depth_scale_ratio: Option<f64>,
     /// The same and the modes, per keyframe.

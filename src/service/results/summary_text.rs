@@ -96,11 +96,13 @@ fn deadline(summary: &Summary) -> Option<String> {
 fn depth_errors(depth: &DepthSummary) -> Option<String> {
     let all = 100.0 * depth.depth_relative_error_median?;
     let best = 100.0 * depth.depth_relative_error_median_best_half?;
-    let unit = depth
+    let scales = depth
         .depth_scale_ratio
-        .map(|ratio| format!(", keyframe scales agree to a factor of {ratio:.2}"));
-    let unit = unit.unwrap_or_default();
-    Some(format!("median relative error {all:.1} %, {best:.1} % over the more certain half{unit}"))
+        .map(|ratio| format!(", depth scales of the keyframes agree to a factor of {ratio:.2}"));
+    let scales = scales.unwrap_or_default();
+    Some(format!(
+        "median relative error {all:.1} %, {best:.1} % over the more certain half{scales}"
+    ))
 }
 
 /// The level and at most two reasons; the report lists what it cannot see.

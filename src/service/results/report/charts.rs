@@ -170,7 +170,7 @@ pub fn scale_over_time(results: &Results<'_>) -> Option<Chart> {
         .collect();
     const MEANING: &str = "Length of the estimated path over that of the ground truth, window by window. 1 everywhere means \
          that the scale does not drift.";
-    let (title, y_label) = ("Scale of 100-frame windows", "scale / overall scale");
+    let (title, y_label) = ("Scale drift: scale of 100-frame windows", "scale / overall scale");
     let series = vec![Series::new("", MAPPING, Mark::Path, points)];
     let chart = Chart::over_time(title, MEANING, y_label, Scaling::Free, series);
     Some(Chart { height: 280.0, ..chart })

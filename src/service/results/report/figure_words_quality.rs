@@ -19,7 +19,7 @@ pub(super) const QUALITY_WORDS: &[Words] = words! {
     rpe_translation_1s: Accuracy, Format::Metres, "Relative error of position over 1 s", "Error of the movement within a second, root mean square: the drift.";
     rpe_rotation_deg_1s: Accuracy, Format::Unit("°"), "Relative error of rotation over 1 s", "Error of the turn within a second, root mean square: the drift.";
     path_length_m: Accuracy, Format::Metres, "Length of the path", "Of the ground truth between compared poses.";
-    window_scale_ratio: Accuracy, Format::Number, "Scale drift", "Largest over smallest scale of windows of 100 frames. 1 is best.";
+    window_scale_ratio: Accuracy, Format::Number, "Scale drift", "Largest over smallest scale of the path in windows of 100 frames. 1 is best.";
     window_error_m: Accuracy, Format::Metres, "Error of short windows", "Median position error of windows of 30 frames, each aligned by itself: without the drift.";
     online: Published, Format::Nested(Group::Published), "As published", "The trajectory as it was published during the run.";
 
@@ -39,6 +39,6 @@ pub(super) const QUALITY_WORDS: &[Words] = words! {
     depth_density: Depth, Format::Percent, "Density", "Share of the keyframes' pixels that have depth.";
     depth_modes: Depth, Format::Named(MODES, false), "Common errors of a keyframe", "Depth that grows across columns or rows of the image, and relief too strong or too weak: medians of the magnitude. 0 is best.";
     depth_modes_whitened: Depth, Format::Named(MODES, false), "Common errors over their standard deviation", "0.67 where the reported standard deviation is right; more means that it is too small.";
-    depth_scale_ratio: Depth, Format::Number, "Scale drift by depth", "Largest over smallest map unit of the keyframes. 1 is best.";
+    depth_scale_ratio: Depth, Format::Number, "Spread of the keyframes' depth scales", "Largest over smallest: how far the keyframes disagree in scale. 1 is best.";
     keyframe_depth: Depth, Format::Drawn, "Depth of each keyframe", "In the charts above.";
 };

@@ -235,6 +235,12 @@ mod tests {
     }
 
     #[test]
+    fn only_the_scale_of_the_path_is_said_to_drift() {
+        let drifting = all_words().filter(|words| words.name.contains("cale drift"));
+        assert_eq!(drifting.map(|words| words.key).collect::<Vec<_>>(), ["window_scale_ratio"]);
+    }
+
+    #[test]
     fn every_column_of_a_table_has_a_heading() {
         let level = LevelSummary {
             level: 0,

@@ -62,7 +62,7 @@ pub fn joint_charts(record: &RunRecord) -> Vec<Chart> {
 const MODES_MEANING: &str = "Depth errors that all points of a keyframe share: depth that grows across the columns or rows \
                              of the image, and relief that is too strong or too weak. 0 is right.";
 
-/// The unit and the common errors of each keyframe's depth over the run; empty without true depth.
+/// The scales and the common errors of each keyframe's depth over the run; empty without true depth.
 pub fn depth_charts(record: &RunRecord, keyframes: &[KeyframeDepth]) -> Vec<Chart> {
     let points = |value: &dyn Fn(&KeyframeDepth) -> Option<f64>| -> Vec<[f64; 2]> {
         let timed = keyframes.iter().map(|of| (secs(record, of.capture_nanos), value(of)));
@@ -79,9 +79,9 @@ pub fn depth_charts(record: &RunRecord, keyframes: &[KeyframeDepth]) -> Vec<Char
         series("relief", ERROR, mode(2)),
     ];
     let mut charts = vec![Chart::over_time(
-        "Unit of the keyframes' depth",
-        "Length of a true metre in each keyframe's depth, over the median of all. 1 everywhere means that the scale does \
-         not drift.",
+        "Depth scales of the keyframes",
+        "Length of a true metre in each keyframe's depth, over the median of all. 1 everywhere means that the keyframes \
+         agree in scale.",
         "map units in a metre / their median",
         Scaling::Free,
         vec![series("", MAPPING, unit)],
