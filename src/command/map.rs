@@ -187,7 +187,7 @@ fn text_of(report: &MapReport) -> String {
             report.width, report.height
         ),
         format!(
-            "keyframes  {}, {} of them with depth, {}",
+            "keyframes  {}, {} of them with depth, {}, certain or not",
             report.keyframes,
             report.keyframes_with_depth,
             counted(report.points, "point")

@@ -38,7 +38,7 @@ pub struct MapReport {
     pub keyframes: usize,
     /// Keyframes whose depth can be read.
     pub keyframes_with_depth: usize,
-    /// Points of all keyframes.
+    /// Points of all keyframes, however uncertain.
     pub points: usize,
     /// Number of corrections of the map.
     pub revision: u64,

@@ -185,7 +185,7 @@ fn cards(summary: &Summary) -> String {
         let note = format!("median; {:.1} % in the more certain half", 100.0 * best);
         card("Depth error", format!("{:.1} %", 100.0 * error), note);
     }
-    let points = format!("{} points", grouped(summary.point_counts.points as u64));
+    let points = format!("{} certain points", grouped(summary.point_counts.points as u64));
     card("Keyframes", summary.keyframes.to_string(), points);
     if let Some(times) = summary.times.track_ms {
         // The deadline counts from a frame's arrival, as the time in the tracker does; latency from its stamp.

@@ -30,7 +30,7 @@ use crate::slam::pose::TrackingState;
 /// Numbers of points, and the time to fuse them.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct PointCounts {
-    /// Points of all keyframes that are certain enough.
+    /// Points of all keyframes whose σ/d is at most `results.max_relative_std_dev`.
     pub points: usize,
     /// Points of `map.ply`: the surface that they are fused into, of the evaluated epoch.
     pub map_points: usize,

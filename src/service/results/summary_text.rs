@@ -66,9 +66,9 @@ fn map(summary: &Summary) -> String {
     };
     let unproven = if is_unproven(summary) { "; no frame was tracked on it" } else { "" };
     format!(
-        "{}{without_depth}, {} fused to {}, epoch {}{unproven}",
+        "{}{without_depth}, {} fused to {} in map.ply, epoch {}{unproven}",
         counted(summary.keyframes, "keyframe"),
-        counted(summary.point_counts.points, "point"),
+        counted(summary.point_counts.points, "certain point"),
         summary.point_counts.map_points,
         summary.epoch
     )
@@ -281,7 +281,7 @@ mod tests {
         (summary.loops.loop_searches, summary.loops.epochs_joined) = (Some(1), Some(1));
         let text = summary_text(&summary);
         for part in [
-            " 1 keyframe (1 without depth), 0 points fused",
+            " 1 keyframe (1 without depth), 0 certain points fused to 0 in map.ply",
             " 1 gap;",
             " 1 estimate of keyframes (0 merged)",
             " 1 keyframe searched, 0 closed, 0 held already, 1 epoch joined; refused: 0 other places,",

@@ -256,7 +256,7 @@ function finishedFigures(header, s) {
     s.frames_in && ["frames tracked", `${percent(s.frames_tracked, s.frames_in)} of ${grouped(s.frames_in)}`],
     s.lost_count !== undefined && ["lost", `${s.lost_count} times`],
     ["keyframes", grouped(header.clusters.length)],
-    ["points shown", header.shown < header.points ? `${grouped(header.shown)} of ${grouped(header.points)}` : grouped(header.points)],
+    ["points of map.ply", header.shown < header.points ? `${grouped(header.shown)} of ${grouped(header.points)} shown` : grouped(header.points)],
     s.latency_ms && ["latency", ms(s.latency_ms)],
     s.track_ms && ["tracking a frame", ms(s.track_ms)],
     typeof s.ate_rmse_m === "number" && ["position error (ATE)", `${(100 * s.ate_rmse_m).toFixed(2)} cm`],

@@ -153,8 +153,8 @@ pub(super) const RUN_WORDS: &[Words] = words! {
 
     keyframes: Map, Format::Count, "Keyframes", "Frames of the final map that have their own depth.";
     keyframes_without_depth: Map, Format::Count, "Keyframes without depth", "Those whose depth is no longer held: the oldest of a long run.";
-    points: Map, Format::Count, "Points of the keyframes", "Points of all keyframes that are certain enough.";
-    map_points: Map, Format::Count, "Points of the map", "Points of the surface that they are fused into: those of map.ply.";
+    points: Map, Format::Count, "Certain points of the keyframes", "Points of all keyframes whose relative standard deviation is at most results.max_relative_std_dev (10 % unless set).";
+    map_points: Map, Format::Count, "Points of the map", "Points of the surface that those of the evaluated epoch are fused into: the points of map.ply.";
     epoch: Map, Format::Count, "Last epoch", "Epoch of the map at the end, counted from 0: a map that is lost for good is restarted.";
     epochs: Map, Format::Count, "Epochs with poses", "Each has its own coordinate frame and scale. 1 is good.";
     map_rejections: Map, Format::Rows(REJECTIONS), "Rejected maps", "How often the map was found to contradict itself and was restarted.";
