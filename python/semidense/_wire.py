@@ -373,7 +373,7 @@ class HealthMessage(ctypes.Structure):
         ("page_faults", ctypes.c_uint64),
         # Capture: total number of frames, 0 where unknown. Mapper: keyframes of the map.
         ("total", ctypes.c_uint64),
-        # State of the last frame, as in `PoseMessage`, or of the map, as in `KeyframeHeader`.
+        # Tracker: state of the last frame, as in `PoseMessage`. Mapper: that of the map, as in `KeyframeHeader`. Capture: largest factor on the grey levels of dim images, 1 where none was dim, 0 where brightening is off.
         ("detail", ctypes.c_uint32),
         # Bytes of `cause` that are used.
         ("cause_bytes", ctypes.c_uint32),

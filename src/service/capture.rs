@@ -80,7 +80,7 @@ struct Shell<'a> {
     config: &'a Config,
     mode: Mode,
     shutdown: &'a Shutdown,
-    source: Box<dyn FrameSource>,
+    source: Brightened<Box<dyn FrameSource>>,
     intrinsics: Intrinsics,
     frames: Publisher<u8, FrameHeader>,
     steps: Subscriber<StepMessage, ()>,
@@ -119,7 +119,7 @@ impl<'a> Shell<'a> {
         }
         let rig = options.rig.as_deref();
         let source = open(&options.source, rig, &config.source_params())?;
-        let source = Box::new(Brightened::new(source, config.capture.brighten));
+        let source = Brightened::new(source, config.capture.brighten);
         for remark in rig_remarks(&options.source, rig) {
             tracing::warn!("{remark}");
         }
@@ -341,6 +341,7 @@ impl<'a> Shell<'a> {
         };
         let _span = tracing::trace_span!("publish", sequence = stamp.sequence).entered();
         count(self.health.counters(), &mut self.next_sequence, &stamp);
+        self.health.counters().detail = self.source.max_factor().map_or(0, u32::from);
         // Before sending: a frame lost between the two is better than one sent twice.
         let counters = self.health.counters();
         self.position.write_or_warn(&Position::at(&stamp, counters.frames, counters.gaps));

@@ -20,6 +20,8 @@ pub struct RunCounters {
     pub frames_in: u64,
     /// Images that the source could not deliver.
     pub frames_refused: u64,
+    /// Largest factor on the grey levels of dim images; `None` where brightening is off.
+    pub brightened_by: Option<u8>,
     /// Gaps in the source's sequence.
     pub gaps: u64,
     /// Processes that were restarted.
@@ -39,6 +41,7 @@ impl RunCounters {
     pub fn add(&mut self, counted: &Self) {
         self.frames_in += counted.frames_in;
         self.frames_refused += counted.frames_refused;
+        self.brightened_by = self.brightened_by.max(counted.brightened_by);
         self.gaps += counted.gaps;
         self.deadline_misses += counted.deadline_misses;
         self.page_faults += counted.page_faults;
@@ -178,6 +181,7 @@ impl Recording {
         RunRecord {
             frames_in: counters.frames_in,
             frames_refused: counters.frames_refused,
+            brightened_by: counters.brightened_by,
             frames_dropped: counters.frames_in.saturating_sub(self.poses.len() as u64),
             poses: self.poses,
             map: parts.map,

@@ -398,6 +398,7 @@ impl<'a> Supervisor<'a> {
                 counted.frames_in = health.frames.max(place.frames);
                 counted.gaps = health.gaps.max(place.gaps);
                 counted.frames_refused = health.refused;
+                counted.brightened_by = u8::try_from(health.detail).ok().filter(|by| *by > 0);
                 counted.send_counts = TimeCounts(health.latency_counts);
             }
             TRACKER => {

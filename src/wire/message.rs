@@ -335,7 +335,8 @@ pub struct HealthMessage {
     pub page_faults: u64,
     /// Capture: total number of frames, 0 where unknown. Mapper: keyframes of the map.
     pub total: u64,
-    /// State of the last frame, as in [`PoseMessage`], or of the map, as in [`KeyframeHeader`].
+    /// Tracker: state of the last frame, as in [`PoseMessage`]. Mapper: that of the map, as in [`KeyframeHeader`].
+    /// Capture: largest factor on the grey levels of dim images, 1 where none was dim, 0 where brightening is off.
     pub detail: u32,
     /// Bytes of `cause` that are used.
     pub cause_bytes: u32,

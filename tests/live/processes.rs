@@ -149,9 +149,8 @@ fn dim_frames_are_brightened_alike_by_a_run_and_a_replay() {
         let ended = finish(rig.command(&arguments));
         assert!(ended.status.success(), "{}", ended.stderr);
         assert!(ended.stderr.contains("the images are dim"), "{}", ended.stderr);
-        let is_told =
-            ended.stdout.contains("images      dim: their grey levels were multiplied by");
-        assert_eq!(is_told, command == "replay", "{}", ended.stdout);
+        let told = "images      dim: their grey levels were multiplied by up to 4\n";
+        assert!(ended.stdout.contains(told), "{}", ended.stdout);
         fs::read_to_string(Path::new(&output).join("trajectory_online.txt")).unwrap()
     };
     let replayed = online("replay", &[]);

@@ -117,7 +117,7 @@ pub struct RunRecord {
     pub frames_refused: u64,
     /// The first of them, and why.
     pub refused: Option<String>,
-    /// Largest factor on the grey levels of dim images; `None` where brightening is off. Replay only.
+    /// Largest factor on the grey levels of dim images; `None` where brightening is off.
     pub brightened_by: Option<u8>,
     /// Frames that the tracker never saw because a newer one had arrived.
     pub frames_dropped: u64,

@@ -222,8 +222,7 @@ pub struct Summary {
     pub frames_refused: u64,
     /// Their number, the first of them, and what is wrong with it; null where there are none.
     pub refused: Option<String>,
-    /// Largest factor on the grey levels of dim images, 1 where none was dim; null where brightening is off. Replay
-    /// only.
+    /// Largest factor on the grey levels of dim images, 1 where none was dim; null where brightening is off.
     pub brightened_by: Option<u8>,
     /// Frames by their state.
     #[serde(flatten)]
