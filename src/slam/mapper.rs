@@ -244,16 +244,23 @@ impl Mapper {
             };
         };
         let is_lost = matches!(pose.state, TrackingState::Lost(_));
-        if !self.is_about(pose, keyframe, is_lost) {
+        let (active_id, active_epoch) = (keyframe.keyframe_id, keyframe.epoch);
+        let is_established = keyframe.map_state == MapState::Established;
+        // An epoch that was joined to another has changed its number.
+        let epoch = self.map.get(pose.keyframe_id).map_or(pose.epoch, |keyframe| keyframe.epoch);
+        if pose.keyframe_id == NO_KEYFRAME || epoch != active_epoch {
+            return StepOutcome::default();
+        }
+        self.follow_odometry(pose);
+        // Until the tracker has received this keyframe, its proposal and its brightness refer to another one.
+        if !is_lost && pose.keyframe_id != active_id {
             return StepOutcome::default();
         }
         let is_usable = pose.world_from_camera.is_finite() && pose.keyframe_from_camera.is_finite();
         let is_turning = pose.state == TrackingState::Degraded(DegradedReason::Turning);
-        let is_trusted = is_usable && keyframe.map_state == MapState::Established;
-        if is_lost || !is_trusted {
+        if is_lost || !is_usable || !is_established {
             return self.recover(input);
         }
-        self.last_world_from_camera = Some(pose.world_from_camera);
         self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
         if is_turning {
             return self.recover(input);
@@ -264,17 +271,6 @@ impl Mapper {
             true => self.locate_frame(frame, pose),
             false => self.extend(input, change_begins),
         }
-    }
-
-    /// Whether a pose refers to the active keyframe: until the tracker has received this keyframe, or this epoch, its
-    /// proposal and its brightness refer to another one.
-    fn is_about(&self, pose: &PoseEstimate, active: &Keyframe, is_lost: bool) -> bool {
-        if !is_lost {
-            return pose.keyframe_id == active.keyframe_id;
-        }
-        // An epoch that was joined to another has changed its number.
-        let epoch = self.map.get(pose.keyframe_id).map_or(pose.epoch, |keyframe| keyframe.epoch);
-        pose.keyframe_id != NO_KEYFRAME && epoch == active.epoch
     }
 
     /// Uses a tracked frame: observes depth, judges the map, then changes the keyframe or remembers the frame.

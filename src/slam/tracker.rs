@@ -256,12 +256,11 @@ impl Tracker {
                 // A bar set by a frame that was lost, or cut short, would let the next one pass.
                 let is_lost = matches!(estimate.state, TrackingState::Lost(_));
                 self.memory.coarse_fit = coarse_fit.filter(|_| !is_lost).or(self.memory.coarse_fit);
-                let is_trusted = reference.map_state() == MapState::Established;
-                let held = match is_trusted && may_turn(estimate.state) {
+                let held = match may_turn(estimate.state) {
                     true => self.turn(&reference, frame, &before, budget),
                     false => {
                         self.end_turning();
-                        let may_be_next = is_trusted && self.params.max_turning_deviation > 0.0;
+                        let may_be_next = self.params.max_turning_deviation > 0.0;
                         self.turning.look_ahead(&estimate, may_be_next);
                         None
                     }
@@ -319,6 +318,11 @@ impl Tracker {
 
     /// Why the frame cannot be aligned at all; fills the pyramid otherwise.
     fn refusal(&mut self, reference: &Reference, frame: &FrameView<'_>) -> Option<LostReason> {
+        // A pose on it would move the last one, at which the mapper anchors the place where it finds the camera.
+        if reference.map_state() == MapState::Rejected {
+            self.memory.motion.stop();
+            return Some(LostReason::MapRejected);
+        }
         let Intrinsics { width, height, .. } = self.intrinsics;
         let fits = frame.is_consistent() && (frame.width, frame.height) == (width, height);
         if !fits {

@@ -6,7 +6,6 @@ use crate::slam::alignment::align::Alignment;
 use crate::slam::alignment::reference::Reference;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::keyframe::MapState;
 use crate::slam::pose::{
     Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState, UNKNOWN_VARIANCE,
     upper_triangle,
@@ -68,11 +67,7 @@ impl Tracker {
         };
         self.memory.motion.observe(nanos, world_from_camera);
         self.memory.brightness = alignment.state.brightness;
-        let state = match reference.map_state() {
-            MapState::Established => verdict,
-            MapState::Rejected => TrackingState::Lost(LostReason::MapRejected),
-        };
-        let estimate = self.unclaimed(frame, Some(reference), state);
+        let estimate = self.unclaimed(frame, Some(reference), verdict);
         self.claim(reference, alignment, &placed, &covariance, PoseEstimate { quality, ..estimate })
     }
 

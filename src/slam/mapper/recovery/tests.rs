@@ -137,6 +137,27 @@ fn a_correction_right_after_relocalisation_keeps_the_odometry_pose() {
 }
 
 #[test]
+fn a_found_camera_keeps_its_last_pose_on_an_earlier_keyframe() {
+    let mut mapper = mapper_with(&[0.0, 1.0]);
+    let pixels = Scene::new(3).render(&CAMERA, &sideways(1.0)).noisy(2.0, 9);
+    let frame = FrameView::new(&CAMERA, 5, 0, &pixels);
+    let at = |x: f64, keyframe_id: u64, epoch: u32| PoseEstimate {
+        state: TrackingState::Tracking,
+        world_from_camera: sideways(x),
+        keyframe_id,
+        epoch,
+        ..PoseEstimate::unknown(&frame)
+    };
+    // The mapper has made keyframe 1 the active one, which the tracker has not received.
+    mapper.active = Some(Active::new(1));
+    mapper.last_world_from_camera = Some(sideways(0.1));
+    for pose in [at(0.3, 0, 0), at(0.7, 9, 1)] {
+        mapper.step(&frame, &pose, None, &mut || {});
+    }
+    assert_eq!(mapper.last_world_from_camera, Some(sideways(0.3)), "not that of another epoch");
+}
+
+#[test]
 fn invalid_points_are_not_restored() {
     let mut map = DepthMap::with_size(CAMERA.width, CAMERA.height);
     let point = DepthPoint { u: 50, v: 40, inverse_depth: 1.0, variance: 1e-4, intensity: 0.0 };
