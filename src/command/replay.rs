@@ -85,7 +85,7 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
     let (name, rig) = args.source.clone().source_and_rig(&config.capture)?;
     let (args, config) = (&args, &meant_config(config, &args, &name)?);
     give_back_large_blocks();
-    let shutdown = Shutdown::install()?;
+    let shutdown = Shutdown::install_final(INTERRUPTED)?;
     let place = Place::new(&config.instance, &config.root)?;
     let output = OutputFolder::prepare(args.output.as_deref())?;
     if let Some(file) = foreign_debug(output.path()).filter(|_| args.debug_images) {

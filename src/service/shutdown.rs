@@ -21,11 +21,25 @@ pub struct Shutdown {
 impl Shutdown {
     /// Takes over SIGINT (Ctrl-C), SIGTERM and, unless it is ignored (`nohup`), SIGHUP (the terminal is closed).
     pub fn install() -> io::Result<Self> {
+        Self::with(None)
+    }
+
+    /// The same, and a Ctrl-C after any of these signals ends the process at once with the exit code `code`.
+    pub fn install_final(code: u8) -> io::Result<Self> {
+        Self::with(Some(code))
+    }
+
+    fn with(final_code: Option<u8>) -> io::Result<Self> {
         let requested = Arc::new(AtomicBool::new(false));
         let (readable, writable) = UnixStream::pair()?;
         let (interrupts, interrupted) = UnixStream::pair()?;
         interrupts.set_nonblocking(true)?;
         signal_hook::low_level::pipe::register(SIGINT, interrupted)?;
+        if let Some(code) = final_code {
+            // Before the flag is: the first signal must find it unset.
+            let requested = Arc::clone(&requested);
+            signal_hook::flag::register_conditional_shutdown(SIGINT, code.into(), requested)?;
+        }
         let hang_up = (!is_ignored(SIGHUP)).then_some(SIGHUP);
         for signal in [SIGINT, SIGTERM].into_iter().chain(hang_up) {
             // The flag first: a thread woken by the descriptor must find it set.

@@ -355,6 +355,30 @@ fn an_interrupted_replay_writes_its_results_so_far() {
 }
 
 #[test]
+fn a_second_interrupt_ends_a_replay_at_once_and_its_journal_remains() {
+    let rig = Rig::new();
+    let output = rig.output();
+    // Many pictures: the end takes longer than the test needs for the second signal.
+    let arguments = ["replay", ENDLESS, "--debug-images", "--output", output.to_str().unwrap()];
+    let child = command(&rig, &arguments).spawn().unwrap();
+    let journal = journal_of(&output, 100);
+    signal(&child, Signal::INT);
+    // Two signals of one kind that are pending at a time are one.
+    let status = format!("/proc/{}/status", child.id());
+    until("the first signal is taken", || {
+        let status = fs::read_to_string(&status).unwrap();
+        status.contains("ShdPnd:\t0000000000000000").then_some(())
+    });
+    signal(&child, Signal::INT);
+    let ended = end(child);
+    assert_eq!(ended.status.code(), Some(130), "{}", ended.stderr);
+    assert!(!output.join("summary.json").exists() && journal.exists(), "{}", ended.stderr);
+    let recovered = finish(rig.command(&["recover", output.to_str().unwrap()]));
+    assert!(recovered.status.success(), "{}", recovered.stderr);
+    assert_set(&output);
+}
+
+#[test]
 fn a_run_is_recovered_without_its_source() {
     let rig = Rig::new();
     let (output, recording) = (rig.output(), rig.folder().join("recording"));
