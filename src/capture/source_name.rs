@@ -3,6 +3,7 @@
 use std::ffi::{OsStr, OsString};
 use std::fmt;
 use std::io::ErrorKind;
+use std::ops::RangeInclusive;
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
@@ -22,6 +23,8 @@ const VIDEO_ENDINGS: [&str; 12] =
 const ARCHIVE_ENDINGS: [&str; 6] = ["zip", "tgz", "gz", "tar", "7z", "xz"];
 /// Extensions of ROS recordings.
 const BAG_ENDINGS: [&str; 2] = ["bag", "db3"];
+/// Rates at which a source can be repeated, frames per second.
+pub const LOOP_RATES_HZ: RangeInclusive<f64> = 0.01..=10_000.0;
 /// Maximum number of a folder's entries that an error lists.
 const MAX_LISTED: usize = 6;
 
@@ -226,7 +229,7 @@ fn mcap_files(folder: &Path) -> Vec<PathBuf> {
 fn parse_loop(text: &str) -> Option<Result<SourceName, SourceError>> {
     let mut parts = text.splitn(3, ':');
     let num_frames = parts.next()?.parse().ok().filter(|&frames| frames > 0)?;
-    let rate_hz = parts.next()?.parse().ok().filter(|rate| (0.01..=10_000.0).contains(rate))?;
+    let rate_hz = parts.next()?.parse().ok().filter(|rate| LOOP_RATES_HZ.contains(rate))?;
     let inner = parts.next().filter(|inner| !inner.starts_with("loop"))?.parse();
     let looped = |inner| SourceName::Looped { num_frames, rate_hz, inner: Box::new(inner) };
     Some(inner.map(looped))

@@ -1,6 +1,7 @@
 //! `semidense bench`: pose latency, idle and under load, and the behaviour of a long run.
 
-use std::ffi::OsString;
+use std::error::Error;
+use std::ffi::{OsStr, OsString};
 use std::fs;
 use std::io::Write;
 use std::ops::RangeInclusive;
@@ -10,7 +11,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
 
-use crate::capture::source_name::SourceName;
+use crate::capture::source_name::{LOOP_RATES_HZ, SourceName};
 use crate::command::ending::journal_options;
 use crate::command::print::{note, print_as};
 use crate::command::run_progress::start_display;
@@ -120,8 +121,6 @@ pub struct SoakArguments {
 
 /// Upper limit for the frames of a trial: a day at 60 Hz; poses are kept until its end.
 const MAX_FRAMES: f64 = 5_184_000.0;
-/// Rates at which a source can be repeated.
-const RATES_HZ: RangeInclusive<f64> = 0.01..=10_000.0;
 
 /// Runs the chosen benchmark.
 pub fn run(
@@ -133,6 +132,25 @@ pub fn run(
     match arguments.what {
         Bench::Latency(arguments) => run_latency(config, common, log, &arguments),
         Bench::Soak(arguments) => run_soak(config, common, log, &arguments),
+    }
+}
+
+fn check_rate(rate_hz: f64) -> Result<(), String> {
+    match LOOP_RATES_HZ.contains(&rate_hz) {
+        true => Ok(()),
+        false => Err(format!("--fps {rate_hz}: choose {LOOP_RATES_HZ:?}")),
+    }
+}
+
+/// The source that a benchmark plays back and forth.
+fn repeated(name: &OsStr) -> Result<SourceName, Box<dyn Error>> {
+    match SourceName::parse(name)? {
+        SourceName::Looped { inner, .. } => Err(format!(
+            "--source {}: a benchmark repeats its source by itself; name {inner} and the rate with --fps",
+            name.display()
+        )
+        .into()),
+        source => Ok(source),
     }
 }
 
@@ -148,15 +166,13 @@ fn run_soak(
     if !(1..=MAX_FRAMES as u64).contains(&frames) {
         return Err(format!("--frames {frames}: choose 1 to {MAX_FRAMES}").into());
     }
-    if !RATES_HZ.contains(&rate_hz) {
-        return Err(format!("--fps {rate_hz}: choose {RATES_HZ:?}").into());
-    }
+    check_rate(rate_hz)?;
     if !PERIODS_S.contains(&arguments.every) {
         return Err(format!("--every {}: choose {PERIODS_S:?} seconds", arguments.every).into());
     }
     let mode = if arguments.lockstep { Mode::Lockstep } else { Mode::Live };
     let period = Duration::from_secs_f64(arguments.every);
-    let source = SourceName::parse(&arguments.source)?;
+    let source = repeated(&arguments.source)?;
     let shutdown = Shutdown::install()?;
     let display = start_display(arguments.json)?;
     let options = common.without_instance().to_arguments();
@@ -201,6 +217,7 @@ fn run_latency(
     log: &ErrorLog,
     arguments: &LatencyArguments,
 ) -> CommandResult {
+    check_rate(arguments.fps)?;
     let frames = (arguments.fps * arguments.seconds).round();
     if !(1.0..=MAX_FRAMES).contains(&frames) {
         return Err(format!(
@@ -209,7 +226,7 @@ fn run_latency(
         )
         .into());
     }
-    let source = SourceName::parse(&arguments.source)?;
+    let source = repeated(&arguments.source)?;
     let shutdown = Shutdown::install()?;
     let mut measurements = Vec::new();
     for disturbance in disturbances(arguments.load) {
@@ -294,4 +311,22 @@ fn table(measurements: &[Measurement]) -> String {
         ));
     }
     lines.join("\n") + "\n"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_repeated_is_refused_before_anything_starts() {
+        for rate_hz in [1e9, 0.0, -30.0, f64::NAN, f64::INFINITY] {
+            let error = check_rate(rate_hz).unwrap_err();
+            assert!(error.starts_with(&format!("--fps {rate_hz}: choose 0.01..=10000")), "{error}");
+        }
+        assert!(check_rate(0.01).is_ok() && check_rate(10_000.0).is_ok());
+        let error = repeated(OsStr::new("loop:9:30:sim:flat")).unwrap_err().to_string();
+        assert!(error.starts_with("--source loop:9:30:sim:flat: "), "{error}");
+        assert!(error.contains("name sim:flat and the rate with --fps"), "{error}");
+        assert_eq!(repeated(OsStr::new("sim")).unwrap(), SourceName::Simulator { scene: None });
+    }
 }
