@@ -50,7 +50,8 @@ pub enum EvaluationError {
     },
     /// Too few poses have ground truth near their stamps.
     #[error(
-        "only {found} of {estimated} poses have ground truth within {max_difference_secs} s (at least {needed} are needed): check that both use the same clock, or allow a larger difference"
+        "only {found} of {estimated} poses have ground truth within {max_difference_secs} s (at least {needed} are needed){}: check that both use the same clock and unit, or allow a larger --max-difference",
+        next_text(*next_secs)
     )]
     TooFewMatches {
         /// Matches found.
@@ -59,6 +60,23 @@ pub enum EvaluationError {
         estimated: usize,
         /// Matches needed.
         needed: usize,
+        /// Largest difference of stamps that was allowed, seconds.
+        max_difference_secs: f64,
+        /// From the stamps of the nearest pose that is not matched to those of the other trajectory, seconds; `None`
+        /// where there is none.
+        next_secs: Option<f64>,
+    },
+    /// All matches are with the same pose.
+    #[error(
+        "all {found} matched poses of the {of} are matched with the same pose of the {only}, within {max_difference_secs} s: check that both use the same clock and unit, or allow a smaller --max-difference"
+    )]
+    OneMatch {
+        /// Matches found.
+        found: usize,
+        /// The trajectory with these poses: `estimate` or `ground truth`.
+        of: &'static str,
+        /// The trajectory with the one pose.
+        only: &'static str,
         /// Largest difference of stamps that was allowed, seconds.
         max_difference_secs: f64,
     },
@@ -75,6 +93,10 @@ pub enum EvaluationError {
         /// Why that epoch cannot be compared.
         reason: Box<EvaluationError>,
     },
+}
+
+fn next_text(next_secs: Option<f64>) -> String {
+    next_secs.map_or(String::new(), |secs| format!(", the next is {secs} s away"))
 }
 
 /// Errors of a trajectory against ground truth. Lengths are in the ground truth's unit.
@@ -196,6 +218,29 @@ mod tests {
     }
 
     #[test]
+    fn matches_with_a_single_pose_are_called_that() {
+        let mut truth = path(40);
+        // In other units: all stamps are nearest to the last one.
+        truth.iter_mut().for_each(|pose| pose.nanos /= 1_000_000);
+        let of = |found, of, only| EvaluationError::OneMatch {
+            found,
+            of,
+            only,
+            max_difference_secs: 3600.0,
+        };
+        let estimate = &path(35)[5..];
+        for alignment in [TrajectoryAlignment::Sim3, TrajectoryAlignment::None] {
+            let evaluate = |a, b| evaluate_trajectory(a, b, alignment, 3_600_000_000_000);
+            let error = evaluate(estimate, &truth).unwrap_err();
+            assert_eq!(error, of(30, "estimate", "ground truth"));
+            let words = "all 30 matched poses of the estimate are matched with the same pose of the ground truth";
+            assert!(error.to_string().starts_with(words), "{error}");
+            let error = evaluate(&truth, estimate).unwrap_err();
+            assert_eq!(error, of(30, "ground truth", "estimate"));
+        }
+    }
+
+    #[test]
     fn arbitrary_input_is_an_error_and_never_a_panic() {
         let truth = path(40);
         let evaluate = |estimate: &[StampedPose], truth: &[StampedPose]| {
@@ -207,6 +252,12 @@ mod tests {
             evaluate(&truth[..2], &truth),
             Err(EvaluationError::TooFewMatches { found: 2, needed: 3, .. })
         ));
+        let mut late = truth.clone();
+        late.iter_mut().for_each(|pose| pose.nanos += 5_020_400_000);
+        let error = evaluate(&late, &truth[..30]).unwrap_err().to_string();
+        assert!(error.starts_with("only 0 of 40 poses"), "{error}");
+        assert!(error.contains(", the next is 4.053733343 s away: "), "{error}");
+        assert!(error.ends_with("or allow a larger --max-difference"), "{error}");
         let mut broken = truth.clone();
         broken[7].world_from_camera.translation.x = f64::NAN;
         let error = evaluate(&broken, &truth).unwrap_err();

@@ -18,6 +18,19 @@ pub fn associate(
     }
 }
 
+/// Differences between the stamps of each pose of the shorter trajectory and the nearest pose of the longer one,
+/// nanoseconds, the smallest first.
+pub fn differences(estimate: &[StampedPose], truth: &[StampedPose]) -> Vec<u64> {
+    let (short, long) =
+        if estimate.len() <= truth.len() { (estimate, truth) } else { (truth, estimate) };
+    let to_nearest = |pose: &StampedPose| {
+        nearest(long, pose.nanos, i64::MAX).map(|j| long[j].nanos.abs_diff(pose.nanos))
+    };
+    let mut differences: Vec<u64> = short.iter().filter_map(to_nearest).collect();
+    differences.sort_unstable();
+    differences
+}
+
 fn matches<'a>(
     short: &'a [StampedPose],
     long: &'a [StampedPose],

@@ -85,7 +85,8 @@ fn none_aligned(
             found: 0,
             estimated,
             needed: 2,
-            max_difference_secs: max_difference_nanos as f64 * 1e-9,
+            max_difference_secs: max_difference_nanos as f64 / 1e9,
+            next_secs: None,
         },
     }
 }

@@ -1,7 +1,7 @@
 //! The errors behind a trajectory's figures: of poses that were aligned together, or of several epochs, each aligned
 //! separately.
 
-use crate::slam::evaluation::association::associate;
+use crate::slam::evaluation::association::{associate, differences};
 use crate::slam::evaluation::statistics::{ErrorStatistics, largest_over_smallest, median};
 use crate::slam::evaluation::trajectory_error::{
     RelativeErrors, absolute_errors, path_length, relative_errors, timed_pairs,
@@ -39,11 +39,28 @@ impl Measured {
         let pairs = associate(estimate, truth, max_difference_nanos);
         let needed = alignment.poses_needed().max(2);
         if pairs.len() < needed {
+            let next = differences(estimate, truth).get(pairs.len()).copied();
             return Err(EvaluationError::TooFewMatches {
                 found: pairs.len(),
                 estimated: estimate.len(),
                 needed,
-                max_difference_secs: max_difference_nanos as f64 * 1e-9,
+                max_difference_secs: max_difference_nanos as f64 / 1e9,
+                next_secs: next.map(|nanos| nanos as f64 / 1e9),
+            });
+        }
+        let (one_estimated, one_true) = pairs[0];
+        let is_one_estimated = pairs.iter().all(|&(e, _)| e == one_estimated);
+        if is_one_estimated || pairs.iter().all(|&(_, t)| t == one_true) {
+            let (of, only) = match is_one_estimated {
+                true => ("ground truth", "estimate"),
+                false => ("estimate", "ground truth"),
+            };
+            let max_difference_secs = max_difference_nanos as f64 / 1e9;
+            return Err(EvaluationError::OneMatch {
+                found: pairs.len(),
+                of,
+                only,
+                max_difference_secs,
             });
         }
         let (estimated, true_poses): (Vec<_>, Vec<_>) =

@@ -160,6 +160,13 @@ pub const TRAJECTORIES: &[Row] = &[
         &["e against f"],
     ),
     row(
+        "a trajectory in another unit of time",
+        "sed '/^#/d; s/^\\([^ .]*\\)[.]/0.00\\1/' recording/groundtruth.txt > e",
+        "semidense evaluate e recording/groundtruth.txt --max-difference 5",
+        1,
+        &["e against recording/groundtruth.txt: all", "with the same pose of the ground truth"],
+    ),
+    row(
         "a missing sensor file",
         "",
         "semidense evaluate recording/groundtruth.txt recording/groundtruth.txt --sensor none.yaml",
