@@ -6,6 +6,7 @@ mod conformance;
 pub mod dataset_writer;
 pub mod decode_error;
 pub mod euroc;
+mod foreign_rig;
 pub(crate) mod frame_store;
 pub mod image_file;
 #[cfg(test)]

@@ -6,6 +6,7 @@ use nalgebra::Vector2;
 use serde::Deserialize;
 
 use crate::capture::decode_error::MAX_SIDE;
+use crate::capture::foreign_rig;
 use crate::capture::listing;
 use crate::capture::rig_error::RigError;
 use crate::capture::source_error::SourceError;
@@ -28,6 +29,9 @@ const WIDEST_DEG: f64 = 300.0;
 const NARROWEST_DEG: f64 = 0.5;
 /// Usual views of robots' cameras, degrees; others get a remark.
 const USUAL_DEG: std::ops::RangeInclusive<f64> = 10.0..=160.0;
+/// Largest ratio of a pixel's sides, which is that of fx and fy. Pixels of cameras are square, those of the video formats
+/// with the widest ones (DV in 16:9) have 1.46.
+const USUAL_ASPECT: f64 = 1.5;
 /// Allowed frame rates, frames per second.
 const RATE_RANGE: std::ops::RangeInclusive<f64> = 0.1..=1000.0;
 
@@ -87,11 +91,14 @@ impl Rig {
     /// Reads a rig from TOML text that came from `path`.
     pub fn from_toml(path: &Path, text: &str) -> Result<Self, RigError> {
         let file: RigFile = toml::from_str(text).map_err(|error| {
+            if let Some((tool, values)) = foreign_rig::tool(text) {
+                return RigError::Foreign { path: path.to_owned(), tool, values };
+            }
             let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
             RigError::Syntax {
                 path: path.to_owned(),
                 line: before.matches('\n').count() + 1,
-                problem: error.message().replace('\n', " "),
+                problem: foreign_rig::with_own_lens(error.message().replace('\n', " ")),
             }
         })?;
         file.rig_of(path)
@@ -153,6 +160,14 @@ impl Rig {
     /// Describes in one line what is unusual about the camera and may be a mistake.
     pub fn remark(&self) -> Option<String> {
         let k = self.camera.intrinsics();
+        let aspect = (k.fx / k.fy).max(k.fy / k.fx);
+        if aspect > USUAL_ASPECT {
+            return Some(format!(
+                "fx = {} and fy = {} belong to pixels with one side {aspect:.1} times as long as the other; cameras have at most \
+                 {USUAL_ASPECT}: is one of them wrong?",
+                k.fx, k.fy
+            ));
+        }
         let is_fisheye = matches!(self.camera.distortion(), Distortion::Equidistant(_));
         let (across, down) =
             (view_deg(k.fx, k.cx, k.width, is_fisheye), view_deg(k.fy, k.cy, k.height, is_fisheye));
@@ -297,6 +312,26 @@ mod tests {
         for (model, focal) in [("pinhole", 50.0), ("pinhole", 90000.0), ("equidistant", 100.0)] {
             let error = rig(model, focal).unwrap_err();
             assert!(error.starts_with(&format!("x.toml: fx = {focal}: must be")), "{error}");
+        }
+    }
+
+    #[test]
+    fn focal_lengths_of_pixels_that_no_camera_has_get_a_remark() {
+        let remark = |fx: f64, fy: f64| {
+            let text = format!(
+                "model = \"pinhole\"\nwidth = 640\nheight = 480\nfx = {fx}\nfy = {fy}\ncx = 320\ncy = 240\n"
+            );
+            Rig::from_toml(Path::new("x.toml"), &text).unwrap().remark()
+        };
+        for (fx, fy) in [(500.0, 500.0), (728.0, 500.0), (500.0, 728.0)] {
+            assert_eq!(remark(fx, fy), None, "{fx} {fy}");
+        }
+        for (fx, fy, ratio) in
+            [(5000.0, 500.0, "10.0"), (500.0, 5000.0, "10.0"), (250.0, 500.0, "2.0")]
+        {
+            let remark = remark(fx, fy).unwrap_or_default();
+            assert!(remark.starts_with(&format!("fx = {fx} and fy = {fy} ")), "{remark}");
+            assert!(remark.contains(&format!("one side {ratio} times as long")), "{remark}");
         }
     }
 

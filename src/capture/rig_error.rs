@@ -17,6 +17,19 @@ pub enum RigError {
         /// The problem, in one line.
         problem: String,
     },
+    /// The calibration file of another tool.
+    #[error(
+        "{}: this is a calibration of {tool}, not a rig: copy one from config/rigs or /usr/share/semidense/rigs and write its values there; {values}",
+        path.display()
+    )]
+    Foreign {
+        /// The file.
+        path: PathBuf,
+        /// The tool that wrote it.
+        tool: &'static str,
+        /// Where the values of a rig are in it.
+        values: &'static str,
+    },
     /// A value that no camera can have.
     #[error("{}: {source}", path.display())]
     Value {

@@ -355,6 +355,13 @@ const RIGS: &[Row] = &[
         &["unknown field `lens`"],
     ),
     row(
+        "a calibration of ROS",
+        "printf 'image_width: 160\\nimage_height: 120\\ndistortion_model: plumb_bob\\n' > camera.yaml",
+        "semidense run recording --rig camera.yaml",
+        1,
+        &["a calibration of ROS (camera_info), not a rig", "model = \"radtan\""],
+    ),
+    row(
         "a value that is not a number",
         "echo 'nan 131 79.5 59.5 160 120' > recording/camera.txt",
         "semidense run recording",
@@ -381,6 +388,13 @@ const RIGS: &[Row] = &[
         "semidense replay recording --rig rig.toml --output out",
         3,
         &["field of view of 4.6°"],
+    ),
+    row(
+        "a focal length ten times that of the other",
+        "change rig.toml 's/fx = .*/fx = 1310/'; rm recording/camera.txt",
+        "semidense replay recording --rig rig.toml --output out --frames 2",
+        3,
+        &["warning: rig.toml: fx = 1310 and fy = 131", "10.0 times"],
     ),
     row(
         "the rig of another camera",
