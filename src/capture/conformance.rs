@@ -317,13 +317,7 @@ const BAD_RECORDINGS: &[(&str, &str, &str, &str, &str)] = &[
     ("tum", "groundtruth.txt", " 2 0 0 0 0 0 1", " 2 0 0 0 0 1", "line 4: needs the eight"),
     ("tum", "groundtruth.txt", " 2 0 0 0 0 0 1", " 2 0 0 0 0 0 0", "line 4: its quaternion"),
     ("tum", "groundtruth.txt", " 2 0 0 0", " inf 0 0 0", "line 4: `inf` is not a finite"),
-    (
-        "tum",
-        "camera.txt",
-        "32 24",
-        "40 24",
-        "rgb/0.png: is 32x24 pixels, but the rig expects 40x24",
-    ),
+    ("tum", "camera.txt", "32 24", "40 24", "rgb/0.png is 32x24 pixels, but the rig expects 40x24"),
     ("tum", "camera.txt", "32 24", "32", "camera.txt: height = 0: must be 16 to 8192"),
     ("tum", "camera.txt", " 0 0", " 0", "camera.txt: coefficients = [-0.1, 0.02, 0.0]: must be"),
     ("tum", "camera.txt", "30 31 15.5 11.5 32 24 -0.1 0.02 0 0", "30 31", "has 2 numbers"),
@@ -375,7 +369,7 @@ fn missing_files_and_entries_are_named() {
         ("images", "times.txt", Some("frame8 3 -1\n"), "line 1: the exposure is -1: must be"),
         ("images", "times.txt", Some("# none\n"), "times.txt: has 0 time stamps for 5 images"),
         ("images", "rig.toml", None, "has no camera.txt; name the camera with --rig FILE"),
-        ("images", "frame11.png", Some(""), "frame11.png: is empty"),
+        ("images", "frame11.png", Some(""), "frame11.png is empty"),
     ] {
         let (_folder, source) = opened(kind, |root| {
             let path = root.join(file);

@@ -26,7 +26,7 @@ pub enum ImageFileError {
         source: std::io::Error,
     },
     /// The content is not the image needed.
-    #[error("{}: {source}", path.display())]
+    #[error("{} {source}", path.display())]
     Decode {
         /// The file.
         path: PathBuf,

@@ -43,7 +43,9 @@ pub fn open(
     Ok(match name {
         SourceName::Tum(folder) => Box::new(tum::open(folder, rig)?),
         SourceName::Euroc(folder) => Box::new(euroc::open(folder, rig)?),
-        SourceName::Images(folder) => Box::new(image_folder::open(folder, rig)?),
+        SourceName::Images(folder) => {
+            Box::new(image_folder::open(folder, rig).map_err(|error| of_recording(folder, error))?)
+        }
         SourceName::Mcap { file, topic } => Box::new(bag::open(file, topic.as_deref(), rig)?),
         SourceName::Simulator { .. } if rig.is_some() => {
             return refused(
@@ -82,6 +84,25 @@ pub fn check_size(name: &str, intrinsics: &Intrinsics) -> Result<(), SourceError
         "its images have {width}x{height} pixels, and tracking needs {MIN_SIDE_PX} to each side; enlarge them"
     );
     Err(SourceError::Name { name: name.to_owned(), problem })
+}
+
+/// The error of a folder without a camera or stamps, where these are in the recording that it is part of.
+fn of_recording(folder: &Path, error: SourceError) -> SourceError {
+    /// EuRoC's images are in cam0/data.
+    const MAX_LEVELS: usize = 2;
+    if !matches!(error, SourceError::NoRig { .. } | SourceError::NoStamps { .. }) {
+        return error;
+    }
+    let folder_path = folder.canonicalize().unwrap_or_default();
+    let around = folder_path.ancestors().skip(1).take(MAX_LEVELS);
+    let has_lists = |name: &SourceName| !matches!(name, SourceName::Images(_));
+    match around.filter_map(SourceName::of_folder).find(has_lists) {
+        Some(recording) => SourceError::Name {
+            name: folder.display().to_string(),
+            problem: format!("this is a folder of images in a recording: name that, {recording}"),
+        },
+        None => error,
+    }
 }
 
 /// For a folder without the layout that its source names, returns the source by the layout that it has.
@@ -134,5 +155,30 @@ fn own_rig(name: &SourceName, folder: &Path) -> Option<(Rig, PathBuf)> {
     match name {
         SourceName::Euroc(_) => euroc::own_rig(folder),
         _ => tum::own_rig(folder),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_images_of_a_recording_are_refused_with_its_name() {
+        let root = tempfile::tempdir().unwrap();
+        let root = root.path().canonicalize().unwrap();
+        for (list, images, recording) in [
+            ("a/rgb.txt", "a/rgb", "tum:{}/a"),
+            ("b/mav0/cam0/data.csv", "b/mav0/cam0/data", "euroc:{}/b/mav0"),
+        ] {
+            let images = root.join(images);
+            std::fs::create_dir_all(&images).unwrap();
+            std::fs::write(root.join(list), "").unwrap();
+            std::fs::write(images.join("1.png"), "").unwrap();
+            let name = SourceName::Images(images.clone());
+            let error = open(&name, None, &SourceParams::default()).err().unwrap().to_string();
+            let recording = recording.replace("{}", &root.display().to_string());
+            assert!(error.starts_with(&format!("source `{}`: ", images.display())), "{error}");
+            assert!(error.ends_with(&format!("name that, {recording}")), "{error}");
+        }
     }
 }

@@ -28,8 +28,8 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 /// The program that reads ROS 2 topics.
 const BRIDGE: &str = "semidense-bridge";
 /// What to do if it is missing.
-pub const INSTALL_BRIDGE: &str = "install the package semidense-bridge (`apt install ./semidense-bridge_*.deb`), or build it \
-     with `cargo build --release -p semidense-bridge`";
+pub const INSTALL_BRIDGE: &str = "install the package semidense-bridge (`apt install ./semidense-bridge_*.deb`), or build it from \
+     the source tree with `cargo install --path bridge`";
 /// Its command that writes the images of a topic to its standard output.
 const BRIDGE_COMMAND: &str = "ros2-camera";
 /// Maximum number of frames taken at a time: a sender that never pauses must not keep capture from its other work.

@@ -88,10 +88,10 @@ mod tests {
         }
         assert_eq!((refused.count(), refused.reasons.len(), refused.logged), (25, 10, 0));
         let error = refused.error().unwrap().to_string();
-        assert!(error.contains("25") && error.contains("0.png: is empty"), "{error}");
+        assert!(error.contains("25") && error.contains("0.png is empty"), "{error}");
         refused.accept();
         assert_eq!(refused.logged, 10);
         assert!(refused.error().is_none());
-        assert!(refused.text().unwrap().starts_with("25 left out, the first: 0.png: is empty"));
+        assert!(refused.text().unwrap().starts_with("25 left out, the first: 0.png is empty"));
     }
 }

@@ -1,6 +1,7 @@
 //! `semidense-bridge record`: writes an instance's topics to an MCAP file.
 
 use std::io::Write;
+use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
@@ -65,7 +66,7 @@ pub fn run(common: &CommonArguments, arguments: &RecordArguments) -> CommandResu
     let place = common.place()?;
     let instance = place.instance.clone();
     let params = RecordParams {
-        output: output_file(&arguments.output, &instance),
+        output: output_file(&arguments.output, &instance)?,
         instance,
         images: arguments.images,
         max_bytes: arguments.max_bytes,
@@ -129,12 +130,21 @@ fn read(
 }
 
 /// Path of the recording; in a folder, named after the instance and the time.
-fn output_file(output: &Path, instance: &str) -> PathBuf {
-    if !output.is_dir() {
-        return output.to_owned();
+fn output_file(output: &Path, instance: &str) -> Result<PathBuf, String> {
+    if output.is_dir() {
+        let nanos = Moment::now().realtime_nanos;
+        return Ok(output.join(format!("{instance}-{}.mcap", nanos / 1_000_000_000)));
     }
-    let nanos = Moment::now().realtime_nanos;
-    output.join(format!("{instance}-{}.mcap", nanos / 1_000_000_000))
+    let is_folder = output.as_os_str().as_bytes().ends_with(b"/");
+    let folder = if is_folder { Some(output) } else { output.parent() };
+    match folder.filter(|folder| !folder.as_os_str().is_empty() && !folder.exists()) {
+        Some(folder) => Err(format!(
+            "--output {}: there is no folder {}; create it, or name another one",
+            output.display(),
+            folder.display()
+        )),
+        None => Ok(output.to_owned()),
+    }
 }
 
 fn print(summary: &RecordSummary, began: Option<Instant>, dropped: u64) {
@@ -153,4 +163,23 @@ fn print(summary: &RecordSummary, began: Option<Instant>, dropped: u64) {
         count(&["details/pose"]),
         count(&["points"]),
     );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_missing_folder_for_the_recording_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| output_file(&folder.path().join(name), "front");
+        assert_eq!(at("run.mcap"), Ok(folder.path().join("run.mcap")));
+        assert!(at("").unwrap().to_string_lossy().contains("/front-"));
+        for (name, missing) in [("new/", "new/"), ("new/run.mcap", "new")] {
+            let missing = format!("there is no folder {}/{missing};", folder.path().display());
+            let error = at(name).unwrap_err();
+            assert!(error.contains(&missing), "{error}");
+        }
+        assert_eq!(output_file(Path::new("run.mcap"), "front"), Ok("run.mcap".into()));
+    }
 }

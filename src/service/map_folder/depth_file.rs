@@ -91,7 +91,7 @@ pub enum DepthFileError {
         value: u64,
     },
     /// Its image cannot be decoded.
-    #[error("image: {0}")]
+    #[error("its image {0}")]
     Image(#[from] DecodeError),
     /// Its points are invalid.
     #[error(transparent)]
