@@ -7,6 +7,7 @@ use clap::Args;
 
 use crate::capture::v4l::listing::{Access, CameraReport, ControlReport, FormatReport, cameras};
 use crate::command::CommandResult;
+use crate::command::parse::no_instance;
 use crate::command::print::print_as;
 
 /// List the cameras of this machine: names, formats, sizes, rates and controls
@@ -14,6 +15,7 @@ use crate::command::print::print_as;
 /// `v4l:` takes a camera's path, its number or one of its names. A usb-… name follows the camera, a pci-…
 /// name the port. Formats in parentheses are not supported.
 #[derive(Debug, Args)]
+#[command(arg = no_instance())]
 pub struct CamerasArguments {
     /// Print the list as JSON
     #[arg(long)]

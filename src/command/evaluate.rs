@@ -10,6 +10,7 @@ use clap::{Args, ValueEnum};
 use crate::capture::euroc::sensor_beside;
 use crate::capture::sensor_yaml;
 use crate::command::evaluate_text::{evaluation_json, evaluation_text};
+use crate::command::parse::no_instance;
 use crate::command::print::{note, print};
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::report::evaluation_plot::evaluation_plot;
@@ -40,6 +41,7 @@ enum Align {
 /// origin and unit: epochs are aligned and evaluated separately, and the total is over the matched poses of
 /// all of them. An epoch with too few poses to align is named and left out.
 #[derive(Debug, Args)]
+#[command(arg = no_instance())]
 pub struct EvaluateArgs {
     /// Estimated trajectory
     #[arg(value_name = "EST")]

@@ -9,6 +9,7 @@ use clap::{Args, Subcommand};
 
 use crate::command::CommandResult;
 use crate::command::map_points::MapPointOptions;
+use crate::command::parse::no_instance;
 use crate::command::print::{note, print, print_as};
 use crate::command::progress::Progress;
 use crate::service::config::{Config, MapConfig};
@@ -110,6 +111,7 @@ struct LoadArguments {
 /// The epochs of both are kept, each with its own origin and unit, and the camera can be found in either.
 /// They are not aligned with each other, even where they show the same place.
 #[derive(Debug, Args)]
+#[command(arg = no_instance())]
 struct MergeArguments {
     /// The first map, which keeps its numbers
     #[arg(value_name = "A")]
@@ -124,6 +126,7 @@ struct MergeArguments {
 
 /// Check every file of a map and list what it contains; exit code 1 if anything is damaged
 #[derive(Debug, Args)]
+#[command(arg = no_instance())]
 struct InfoArguments {
     /// The map's folder
     #[arg(value_name = "MAP")]

@@ -2,7 +2,7 @@
 //! the range that a negative number misses.
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
-use clap::{Command, Error, Parser};
+use clap::{Arg, ArgMatches, Command, Error, Parser};
 
 /// Parses the command line; prints help, version or an error and ends the process.
 pub fn parse<T: Parser>() -> T {
@@ -15,7 +15,35 @@ fn try_parse<T: Parser, W: Into<std::ffi::OsString> + Clone>(
     let mut command = with_negative_numbers(T::command());
     let matches = command.try_get_matches_from_mut(words);
     let matches = matches.map_err(|error| with_owner(&command, error))?;
+    check_instance(&command, &matches)?;
     T::from_arg_matches(&matches).map_err(|error| error.format(&mut command))
+}
+
+/// Id and name of the option that [`no_instance`] withdraws.
+const INSTANCE: &str = "instance";
+
+/// Replaces the common option `--instance` of a command that has nothing to do with any instance.
+pub fn no_instance() -> Arg {
+    Arg::new(INSTANCE).long(INSTANCE).value_name("NAME").hide(true)
+}
+
+/// Refuses `--instance`, also before the command, where the command has [`no_instance`].
+fn check_instance(command: &Command, matches: &ArgMatches) -> Result<(), Error> {
+    let (mut command, mut matches) = (command, matches);
+    while let Some((name, below)) = matches.subcommand() {
+        let Some(found) = command.find_subcommand(name) else { break };
+        (command, matches) = (found, below);
+    }
+    let is_withdrawn = command.get_arguments().any(|a| a.get_id() == INSTANCE && a.is_hide_set());
+    if !is_withdrawn || !matches.contains_id(INSTANCE) {
+        return Ok(());
+    }
+    let mut error = Error::new(ErrorKind::UnknownArgument).with_cmd(command);
+    let name = format!("--{INSTANCE}");
+    error.insert(ContextKind::InvalidArg, ContextValue::String(name));
+    let usage = command.clone().render_usage();
+    error.insert(ContextKind::Usage, ContextValue::StyledStr(usage));
+    Err(error)
 }
 
 /// Takes `-3` as the value of the preceding option, not as an option.
@@ -92,6 +120,41 @@ mod tests {
         let error = refused("semidense --live run");
         assert!(error.contains("'run --live' exists"), "{error}");
         assert!(!refused("semidense run --fast").contains("belongs"));
+    }
+
+    #[test]
+    fn commands_that_concern_no_instance_neither_offer_nor_accept_one() {
+        let without = [
+            ("evaluate", "evaluate a b"),
+            ("cameras", "cameras"),
+            ("map info", "map info m"),
+            ("map merge", "map merge a b --output c"),
+        ];
+        for (name, line) in without {
+            for line in
+                [format!("semidense {line} --instance x"), format!("semidense --instance x {line}")]
+            {
+                let error = refused(&line);
+                assert!(
+                    error.starts_with("error: unexpected argument '--instance' found"),
+                    "{error}"
+                );
+                assert!(error.contains(&format!("Usage: semidense {name} ")), "{error}");
+            }
+            assert!(try_parse::<CommandLine, _>(format!("semidense {line}").split(' ')).is_ok());
+            let help = refused(&format!("semidense {name} --help"));
+            assert!(help.contains("--config") && !help.contains("--instance"), "{help}");
+        }
+        for line in
+            ["status --instance x", "--instance x map save", "map export m --output o --instance x"]
+        {
+            let line = format!("semidense {line}");
+            let CommandLine { common, .. } = try_parse(line.split(' ')).unwrap();
+            assert_eq!(common.instance.as_deref(), Some("x"), "{line}");
+        }
+        for name in ["status", "map", "map load", "replay"] {
+            assert!(refused(&format!("semidense {name} --help")).contains("--instance"), "{name}");
+        }
     }
 
     #[test]
