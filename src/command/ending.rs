@@ -93,7 +93,9 @@ impl Ending<'_> {
         if !self.json {
             let (recovery, refused) =
                 (recovery_text(&results.summary), refused_text(&results.summary));
-            let map = map_text(&self.config.map).map_or(String::new(), |text| format!("{text}\n"));
+            let loaded = record.loaded_map.as_ref().map(|loaded| &loaded.config);
+            let maps = [&self.config.map].into_iter().chain(loaded).filter_map(map_text);
+            let map: String = maps.map(|text| format!("{text}\n")).collect();
             print_outcome(&format!("{map}{where_to}{recovery}{refused}\n"))?;
         }
         self.conclude(&record.ended, &results.summary, &where_to)

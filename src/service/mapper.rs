@@ -2,7 +2,7 @@
 
 mod commands;
 mod output;
-mod used_map;
+pub(crate) mod used_map;
 
 use std::panic::resume_unwind;
 use std::rc::Rc;

@@ -18,6 +18,7 @@ use crate::service::final_map::{FinalMapError, final_map};
 use crate::service::health::{ProcessState, cause};
 use crate::service::journal::{Journal, JournalOptions};
 use crate::service::map_folder::session::{MapSessionError, check_camera};
+use crate::service::mapper::used_map::loaded_map;
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
 use crate::service::position::{position_key, read_position};
@@ -156,14 +157,14 @@ fn supervise(
         deadline_ms: config.tracker.deadline_ms,
         counters,
     });
-    let record = RunRecord { ended, refused, restart_causes, ..record };
+    let loaded_map = loaded_map(place);
+    let record = RunRecord { ended, refused, restart_causes, loaded_map, ..record };
     Ok(RunOutcome { record, journal, source })
 }
 
 /// Begins the journal of the run, which continues without one.
 fn begin_journal(options: &RunOptions, place: &Place) -> Option<Journal> {
-    let begun = Journal::begin(options.journal.as_ref()?, place);
-    begun
+    Journal::begin(options.journal.as_ref()?, place)
         .inspect_err(|error| {
             tracing::warn!(
                 "no journal is kept ({error}); if this process is killed, the run is lost"

@@ -2,8 +2,9 @@
 
 use crate::records::{UNIT_M, keyframe, nanos, pose, record, written};
 use semidense::service::adjustments::{AdjustmentRecord, Fate, SearchRecord};
+use semidense::service::config::MapConfig;
 use semidense::service::results::output_folder::prepare_output;
-use semidense::service::results::record::{Rejection, RunRecord};
+use semidense::service::results::record::{LoadedMap, Rejection, RunRecord};
 use semidense::service::trajectory_file::{read_trajectory, read_trajectory_file};
 use semidense::slam::evaluation::MAX_DIFFERENCE_NANOS;
 use semidense::slam::evaluation::depth_error::DepthScale;
@@ -11,6 +12,7 @@ use semidense::slam::evaluation::epochs::evaluate_epochs;
 use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::graph::constraint::Refusal;
+use semidense::slam::keyframe::Keyframe;
 use semidense::slam::loops::{SearchOutcome, SearchReport};
 use semidense::slam::map::{ConfirmedPoint, RealignedFrame};
 use semidense::slam::mapper::consistency::Contradiction;
@@ -44,6 +46,25 @@ fn frames_aligned_afterwards_count_only_if_the_map_was_tracked_on() {
         assert_eq!(summary["untracked"].is_null(), tracked > 0);
         let lines = std::fs::read_to_string(folder.path().join("out/trajectory.txt")).unwrap();
         assert_eq!(lines.lines().filter(|line| !line.starts_with('#')).count(), tracked);
+    }
+}
+
+#[test]
+fn a_map_loaded_on_request_is_not_graded_as_a_broken_one() {
+    let poses = (0..60).map(|i| pose(i, TrackingState::Tracking, i as u64 / 20)).collect();
+    let in_epoch = |id| Keyframe { epoch: id as u32, ..keyframe(id) };
+    let record = record(poses, (0..3).map(in_epoch).collect(), false);
+    for (first_epoch, parts) in [(None, Some(3)), (Some(1), Some(2)), (Some(2), None)] {
+        let config = MapConfig::default();
+        let loaded_map = first_epoch.map(|first_epoch| LoadedMap { config, first_epoch });
+        let folder = tempfile::tempdir().unwrap();
+        let loaded = RunRecord { loaded_map, ..record.clone() };
+        let (summary, _) = written(&folder.path().join("out"), &loaded);
+        assert_eq!(summary["epochs"], 3);
+        let reasons = summary["grade"]["reasons"].to_string();
+        let expected = parts.map(|parts| format!("the map has {parts} separate parts"));
+        assert_eq!(reasons.contains("separate parts"), parts.is_some(), "{reasons}");
+        assert!(reasons.contains(&expected.unwrap_or_default()), "{reasons}");
     }
 }
 

@@ -62,13 +62,14 @@ impl Running {
         });
     }
 
-    /// Ends it as Ctrl-C does.
-    fn stop(self) {
+    /// Ends it as Ctrl-C does; returns its summary.
+    fn stop(self) -> serde_json::Value {
         const INTERRUPTED: i32 = 130;
         signal(&self.child, Signal::INT);
         let ended = end(self.child);
         assert_eq!(ended.status.code(), Some(INTERRUPTED), "{}", ended.stderr);
         assert!(!ended.stderr.contains("panicked"), "{}", ended.stderr);
+        serde_json::from_str(&ended.stdout).unwrap()
     }
 }
 
@@ -119,7 +120,9 @@ fn a_running_mapper_continues_in_another_map_and_so_does_its_successor() {
     let second_saves = saves(&other);
     until("a save of the next mapper", || (saves(&other) > second_saves + 1).then_some(()));
     let own_folder = running.own.clone();
-    running.stop();
+    let summary = running.stop();
+    let reasons = summary["grade"]["reasons"].to_string();
+    assert!(summary["epochs"] == 2 && !reasons.contains("separate parts"), "{summary}");
     assert_eq!(saves(&own_folder), own_saves, "the map before was written again");
     assert_eq!(whole(&own_folder).keyframes, own.keyframes);
     // On disk the earlier ids are unchanged, and no keyframe of the run's own map is among them.

@@ -144,15 +144,18 @@ impl Shell<'_> {
         self.report_while(begin).unwrap_or_else(|_| Err("reading the map has failed".to_owned()))
     }
 
-    /// Live: a successor begins in the other map, not with what was left of this one.
+    /// Notes the other map for the run's results and, live, for a successor, which does not begin with what was left of
+    /// this one.
     fn forget_checkpoint(&mut self) -> Result<(), String> {
-        let Some(mut kept) = self.kept.take() else { return Ok(()) };
         let (path, note) = (self.place.checkpoint_path(), self.place.loaded_map_path());
-        kept.remove_on_drop();
-        drop(kept);
+        let kept = self.kept.take();
+        let is_kept = kept.is_some();
+        kept.into_iter().for_each(|mut kept| kept.remove_on_drop());
         let written = self.used.write(&note);
-        self.kept = Kept::open(&path).0;
-        self.kept.iter_mut().for_each(Kept::reserve);
+        if is_kept {
+            self.kept = Kept::open(&path).0;
+            self.kept.iter_mut().for_each(Kept::reserve);
+        }
         written.map_err(|error| format!("{}: {error}", note.display()))
     }
 }

@@ -12,6 +12,7 @@ use crate::service::atomic_file::write_privately;
 use crate::service::checkpoint::Kept;
 use crate::service::config::MapConfig;
 use crate::service::map_folder::numbering::Numbering;
+use crate::service::results::record::LoadedMap;
 use crate::slam::map::Map;
 use crate::wire::place::Place;
 
@@ -28,6 +29,12 @@ pub(super) struct UsedMap {
     pub(super) switched_to: Option<MapConfig>,
     /// The map's numbers in this run.
     pub(super) numbering: Numbering,
+}
+
+/// The map that the mapper of a run has switched to; `None` where it stayed in its own.
+pub(crate) fn loaded_map(place: &Place) -> Option<LoadedMap> {
+    let used = UsedMap::read(&place.loaded_map_path()).ok()??;
+    Some(LoadedMap { config: used.switched_to?, first_epoch: used.numbering.epochs })
 }
 
 /// Opens the checkpoint of a live mapper, and reads what a dead one left: a map that it made in another folder than the
@@ -138,6 +145,17 @@ mod tests {
         let map = Map { keyframes, active: Some(7), free_epoch: 5, ..Map::default() };
         crate::service::map_file::write_map(&place.checkpoint_path(), &map, &mut || {}).unwrap();
         used
+    }
+
+    #[test]
+    fn the_map_that_a_run_has_switched_to_is_told_from_its_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        assert_eq!(loaded_map(&place), None);
+        UsedMap::of(&config("/a")).write(&place.loaded_map_path()).unwrap();
+        assert_eq!(loaded_map(&place), None);
+        left(&place);
+        assert_eq!(loaded_map(&place), Some(LoadedMap { config: config("/b"), first_epoch: 2 }));
     }
 
     #[test]

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::service::adjustments::{AdjustmentRecord, SearchRecord};
 use crate::service::alignment_stamps::AlignmentTrace;
+use crate::service::config::MapConfig;
 use crate::service::results::budget_curve::BudgetSample;
 use crate::service::time_counts::TimeCounts;
 use crate::slam::evaluation::depth_error::DepthScale;
@@ -91,6 +92,15 @@ pub struct RestartCause {
     pub count: u64,
 }
 
+/// A map that a running mapper was switched to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LoadedMap {
+    /// Its folder and use.
+    pub config: MapConfig,
+    /// The run's first epoch in it: those below belong to the map before.
+    pub first_epoch: u32,
+}
+
 /// Everything that is recorded of a run.
 #[derive(Debug, Clone, Default)]
 pub struct RunRecord {
@@ -104,6 +114,8 @@ pub struct RunRecord {
     pub poses: Vec<RecordedPose>,
     /// The map at the end.
     pub map: Map,
+    /// The map that was loaded on request during the run.
+    pub loaded_map: Option<LoadedMap>,
     /// True poses in order of their stamps, empty where there are none.
     pub ground_truth: Vec<StampedPose>,
     /// Source of the metric scale when depth is compared.

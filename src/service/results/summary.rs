@@ -244,7 +244,7 @@ pub struct Summary {
     pub untracked: Option<String>,
     /// Keyframes of the final map.
     pub keyframes: u64,
-    /// Those of them without depth: the oldest of a long run, or those that a recovery could not find.
+    /// Those of them without depth: the oldest of a long run, those of a map before `map load`, or those that a recovery could not find.
     pub keyframes_without_depth: u64,
     /// Their points, and those of `map.ply`.
     #[serde(flatten)]
@@ -365,7 +365,7 @@ impl Summary {
             keyframes_without_depth: without_depth(&record.map),
             point_counts: points,
             epoch: record.poses.last().map_or(0, |pose| pose.estimate.epoch),
-            epochs: count_epochs(record),
+            epochs: count_epochs(record, 0),
             evaluated_epoch: trajectory.and_then(|_| longest_epoch(record)),
             send_ms: record.send_counts.as_ref().and_then(Percentiles::of_counts),
             latency: LatencySummary::of(&record.poses),
@@ -425,11 +425,13 @@ fn grade(record: &RunRecord) -> Grade {
     let (first, last) = (sequences.clone().min(), sequences.max());
     let frames = last.zip(first).map_or(0, |(last, first)| last - first + 1);
     let counts = FrameCounts::of(&record.poses, &record.map);
+    // A map that was left for another one on request is no separate part of that.
+    let first_epoch = record.loaded_map.as_ref().map_or(0, |loaded| loaded.first_epoch);
     Grade::of(&GradeInput {
         frames_tracked: counts.frames_tracked,
         frames_lost: counts.frames_lost,
         losses: count_losses(&record.poses),
-        epochs: count_epochs(record),
+        epochs: count_epochs(record, first_epoch),
         are_poses_given: record.depth_scale == DepthScale::Given,
         rejections: record.rejections.as_ref().map_or(0, |all| all.len() as u64),
         frames,
@@ -448,9 +450,10 @@ fn is_lost(state: TrackingState) -> bool {
     matches!(state, TrackingState::Lost(_))
 }
 
-/// Epochs of the poses that are written: one that was joined to another does not count.
-fn count_epochs(record: &RunRecord) -> u64 {
-    final_poses(record).iter().map(|of| of.epoch).collect::<BTreeSet<_>>().len() as u64
+/// Epochs from `first` on of the poses that are written: one that was joined to another does not count.
+fn count_epochs(record: &RunRecord, first: u32) -> u64 {
+    let epochs = final_poses(record).into_iter().map(|of| of.epoch).filter(|&of| of >= first);
+    epochs.collect::<BTreeSet<_>>().len() as u64
 }
 
 /// Transitions to Lost.

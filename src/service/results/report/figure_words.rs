@@ -152,7 +152,7 @@ pub(super) const RUN_WORDS: &[Words] = words! {
     whitened_residual_median: Tracking, Format::Number, "Residual over its standard deviation", "Median over the tracked frames: 1 is as modelled; above 1.5 the calibration is doubtful.";
 
     keyframes: Map, Format::Count, "Keyframes", "Frames of the final map that have their own depth.";
-    keyframes_without_depth: Map, Format::Count, "Keyframes without depth", "Those whose depth is no longer held: the oldest of a long run.";
+    keyframes_without_depth: Map, Format::Count, "Keyframes without depth", "Those whose depth is no longer held: the oldest of a long run, and those of a map that was left for another one (`map load`).";
     points: Map, Format::Count, "Certain points of the keyframes", "Points of all keyframes whose relative standard deviation is at most results.max_relative_std_dev (10 % unless set).";
     map_points: Map, Format::Count, "Points of the map", "Points of the surface that those of the evaluated epoch are fused into: the points of map.ply.";
     epoch: Map, Format::Count, "Last epoch", "Epoch of the map at the end, counted from 0: a map that is lost for good is restarted.";
