@@ -4,11 +4,15 @@
 //     ./keyframes [INSTANCE [NUMBER_OF_KEYFRAMES]]
 #include <algorithm>
 #include <cmath>
+#include <cstdlib>
 #include <iostream>
 #include <string>
 #include <vector>
 
 #include <semidense.hpp>
+
+static const char USAGE[] = "usage: keyframes [INSTANCE [NUMBER_OF_KEYFRAMES]]\n"
+                            "Prints what every keyframe knows; waits for the instance (default: semidense).\n";
 
 static void print(const semidense::keyframe &keyframe) {
     std::vector<float> depths, deviations;
@@ -38,12 +42,23 @@ static void print(const semidense::keyframe &keyframe) {
 }
 
 int main(int argc, char **argv) {
+    const std::vector<std::string> arguments(argv + 1, argv + argc);
+    if (arguments.size() == 1 && (arguments[0] == "--help" || arguments[0] == "-h")) {
+        std::cout << USAGE;
+        return 0;
+    }
+    char *end = nullptr;
+    long left = arguments.size() > 1 ? std::strtol(argv[2], &end, 10) : -1;
+    const bool is_number = arguments.size() < 2 || (end != argv[2] && *end == '\0' && left >= 0);
+    if (arguments.size() > 2 || !is_number || (!arguments.empty() && arguments[0].rfind('-', 0) == 0)) {
+        std::cerr << USAGE;
+        return 2;
+    }
     try {
         semidense::options where;
-        if (argc > 1) {
+        if (!arguments.empty()) {
             where.instance = argv[1];
         }
-        long left = argc > 2 ? std::stol(argv[2]) : -1;
         semidense::reader reader(SEMIDENSE_WANT_KEYFRAMES | SEMIDENSE_WANT_GRAPH | SEMIDENSE_WANT_FRAMES, where);
         while (left != 0 && reader.wait()) {
             if (const auto graph = reader.newest_graph()) {

@@ -6,8 +6,12 @@
 #include <poll.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include <semidense.h>
+
+static const char USAGE[] = "usage: poses [INSTANCE [NUMBER_OF_POSES]]\n"
+                            "Prints the pose of every frame; waits for the instance (default: semidense).\n";
 
 static const char *const STATES[] = {"initializing", "tracking", "degraded", "lost"};
 
@@ -24,8 +28,18 @@ static void print(const semidense_pose *pose) {
 }
 
 int main(int argc, char **argv) {
+    if (argc == 2 && (strcmp(argv[1], "--help") == 0 || strcmp(argv[1], "-h") == 0)) {
+        fputs(USAGE, stdout);
+        return EXIT_SUCCESS;
+    }
     const char *instance = argc > 1 ? argv[1] : NULL;
-    long left = argc > 2 ? strtol(argv[2], NULL, 10) : -1;
+    char *end = NULL;
+    long left = argc > 2 ? strtol(argv[2], &end, 10) : -1;
+    int is_number = argc < 3 || (end != argv[2] && *end == '\0' && left >= 0);
+    if (argc > 3 || !is_number || (argc > 1 && argv[1][0] == '-')) {
+        fputs(USAGE, stderr);
+        return 2;
+    }
     semidense_reader *reader = NULL;
     if (semidense_open(instance, NULL, SEMIDENSE_WANT_POSES, -1, &reader) != SEMIDENSE_STATUS_OK) {
         return failed("open");

@@ -228,6 +228,24 @@ fn a_cpp_program_reads_keyframes_frames_and_the_graph() {
 }
 
 #[test]
+fn the_examples_print_their_usage_instead_of_waiting() {
+    let rig = Rig::new();
+    for (compiler, source) in [(C, "examples/poses.c"), (CPP, "examples/keyframes.cpp")] {
+        let program = rig.compile(compiler, source, true);
+        let help = rig.run(&program, &["--help"]);
+        assert!(help.status.success() && help.stderr.is_empty(), "{}", text(&help.stderr));
+        assert!(text(&help.stdout).starts_with("usage: "), "{}", text(&help.stdout));
+        for arguments in
+            [&["--fast"][..], &["x", "many"], &["x", ""], &["x", "-3"], &["x", "3", "4"]]
+        {
+            let wrong = rig.run(&program, arguments);
+            assert_eq!(wrong.status.code(), Some(2), "{arguments:?}");
+            assert!(wrong.stdout.is_empty() && text(&wrong.stderr).starts_with("usage: "));
+        }
+    }
+}
+
+#[test]
 fn misuse_is_an_error_and_never_a_crash() {
     let rig = Rig::running();
     let done = rig.run(&rig.compile(C, "tests/misuse.c", true), &[]);
