@@ -93,8 +93,10 @@ impl Ending<'_> {
         if !self.json {
             let (recovery, refused) =
                 (recovery_text(&results.summary), refused_text(&results.summary));
-            let loaded = record.loaded_map.as_ref().map(|loaded| &loaded.config);
-            let maps = [&self.config.map].into_iter().chain(loaded).filter_map(map_text);
+            let MapConfig { folder, read_only, .. } = &self.config.map;
+            let loaded = record.loaded_map.iter().map(|of| (&of.folder, of.read_only));
+            let maps = [(folder, *read_only)].into_iter().chain(loaded);
+            let maps = maps.filter_map(|(folder, read_only)| map_text(folder, read_only));
             let map: String = maps.map(|text| format!("{text}\n")).collect();
             print_outcome(&format!("{map}{where_to}{recovery}{refused}\n"))?;
         }
@@ -159,19 +161,18 @@ fn closing_text(ended: &EndOfRun, untracked: Option<&str>, place: Option<&str>) 
     })
 }
 
-/// What the folder of the run's map holds now; `None` where the run had none.
-fn map_text(config: &MapConfig) -> Option<String> {
-    if config.folder.is_empty() {
+/// What the folder of a map of the run holds now; `None` where the run had none.
+fn map_text(folder: &str, read_only: bool) -> Option<String> {
+    if folder.is_empty() {
         return None;
     }
-    let folder = &config.folder;
     Some(match read_manifest(Path::new(folder)) {
         Ok((manifest, _)) => {
             let keyframes = counted(manifest.keyframes.len(), "keyframe");
             let epochs: BTreeSet<u32> =
                 manifest.keyframes.iter().map(|listed| listed.keyframe.epoch).collect();
             let in_epochs = counted(epochs.len(), "epoch");
-            let unchanged = if config.read_only { ", unchanged" } else { "" };
+            let unchanged = if read_only { ", unchanged" } else { "" };
             format!("map in {folder}: {keyframes} in {in_epochs}{unchanged}")
         }
         Err(MapFolderError::Missing(_)) => format!("no map was begun in {folder}"),

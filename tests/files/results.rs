@@ -2,7 +2,6 @@
 
 use crate::records::{UNIT_M, keyframe, nanos, pose, record, written};
 use semidense::service::adjustments::{AdjustmentRecord, Fate, SearchRecord};
-use semidense::service::config::MapConfig;
 use semidense::service::results::output_folder::prepare_output;
 use semidense::service::results::record::{LoadedMap, Rejection, RunRecord};
 use semidense::service::trajectory_file::{read_trajectory, read_trajectory_file};
@@ -55,8 +54,8 @@ fn a_map_loaded_on_request_is_not_graded_as_a_broken_one() {
     let in_epoch = |id| Keyframe { epoch: id as u32, ..keyframe(id) };
     let record = record(poses, (0..3).map(in_epoch).collect(), false);
     for (first_epoch, parts) in [(None, Some(3)), (Some(1), Some(2)), (Some(2), None)] {
-        let config = MapConfig::default();
-        let loaded_map = first_epoch.map(|first_epoch| LoadedMap { config, first_epoch });
+        let (folder, read_only) = (String::new(), false);
+        let loaded_map = first_epoch.map(|of| LoadedMap { folder, read_only, first_epoch: of });
         let folder = tempfile::tempdir().unwrap();
         let loaded = RunRecord { loaded_map, ..record.clone() };
         let (summary, _) = written(&folder.path().join("out"), &loaded);

@@ -34,7 +34,8 @@ pub(super) struct UsedMap {
 /// The map that the mapper of a run has switched to; `None` where it stayed in its own.
 pub(crate) fn loaded_map(place: &Place) -> Option<LoadedMap> {
     let used = UsedMap::read(&place.loaded_map_path()).ok()??;
-    Some(LoadedMap { config: used.switched_to?, first_epoch: used.numbering.epochs })
+    let MapConfig { folder, read_only, .. } = used.switched_to?;
+    Some(LoadedMap { folder, read_only, first_epoch: used.numbering.epochs })
 }
 
 /// Opens the checkpoint of a live mapper, and reads what a dead one left: a map that it made in another folder than the
@@ -155,7 +156,8 @@ mod tests {
         UsedMap::of(&config("/a")).write(&place.loaded_map_path()).unwrap();
         assert_eq!(loaded_map(&place), None);
         left(&place);
-        assert_eq!(loaded_map(&place), Some(LoadedMap { config: config("/b"), first_epoch: 2 }));
+        let loaded = LoadedMap { folder: "/b".to_owned(), read_only: false, first_epoch: 2 };
+        assert_eq!(loaded_map(&place), Some(loaded));
     }
 
     #[test]

@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::service::adjustments::{AdjustmentRecord, SearchRecord};
 use crate::service::alignment_stamps::AlignmentTrace;
-use crate::service::config::MapConfig;
 use crate::service::results::budget_curve::BudgetSample;
 use crate::service::time_counts::TimeCounts;
 use crate::slam::evaluation::depth_error::DepthScale;
@@ -95,8 +94,10 @@ pub struct RestartCause {
 /// A map that a running mapper was switched to.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoadedMap {
-    /// Its folder and use.
-    pub config: MapConfig,
+    /// Its folder.
+    pub folder: String,
+    /// Whether the camera is only localised in it.
+    pub read_only: bool,
     /// The run's first epoch in it: those below belong to the map before.
     pub first_epoch: u32,
 }

@@ -117,6 +117,27 @@ const SOURCES: &[Row] = &[
     ),
     row("a loop without its numbers", "", "semidense run loop:sim", 1, &["loop:FRAMES:HZ:SOURCE"]),
     row("a source twice", "", "semidense run recording --source sim", 2, &["cannot be used"]),
+    row(
+        "a benchmark at an impossible rate",
+        "",
+        "semidense bench latency --fps 1e9 --seconds 0.001",
+        1,
+        &["--fps 1000000000: choose 0.01"],
+    ),
+    row(
+        "a benchmark of a source that is repeated already",
+        "",
+        "semidense bench soak --source loop:9:30:sim",
+        1,
+        &["--source loop:9:30:sim: ", "name sim and the rate"],
+    ),
+    row(
+        "the images of a recording",
+        "",
+        "semidense run recording/rgb",
+        1,
+        &["a folder of images in a recording: name that, tum:"],
+    ),
 ];
 
 const IMAGES: &[Row] = &[
