@@ -57,13 +57,18 @@ const USER_KEYS: [&str; 42] = [
     "simulator.motion.mean_speed_m_s",
 ];
 
-/// Replaced keys and their replacements: one model of the camera's noise instead of one per algorithm.
-const MOVED_KEYS: [(&str, &str); 5] = [
+/// Replaced keys and their replacements, which take the same values.
+const MOVED_KEYS: [(&str, &str); 7] = [
     ("tracking.alignment.pixel_noise", "noise.pixel_std_dev"),
     ("tracking.alignment.model_noise", "noise.model_std_dev"),
     ("tracking.reference.selection.intensity_std_dev", "noise.model_std_dev"),
     ("mapping.matching.image_noise", "noise.pixel_std_dev"),
     ("mapping.two_frame.fit.image_noise", "noise.pixel_std_dev"),
+    ("mapping.two_frame.max_witnesses", "mapping.two_frame.max_earlier_frames"),
+    (
+        "mapping.two_frame.evidence.min_early_witnesses",
+        "mapping.two_frame.evidence.min_earlier_frames",
+    ),
 ];
 
 /// An error in the two parts of a file.

@@ -225,6 +225,21 @@ fn the_camera_noise_is_shared_and_replaced_keys_are_named() {
 }
 
 #[test]
+fn a_renamed_key_is_told_its_name() {
+    let start = "mapping.two_frame";
+    let renamed = [
+        ("max_witnesses", "max_earlier_frames"),
+        ("evidence.min_early_witnesses", "evidence.min_earlier_frames"),
+    ];
+    for (before, now) in renamed {
+        let told = set(&[&format!("{start}.{before}=5")]).unwrap_err();
+        let expected = format!("`{start}.{before}` is now `expert.{start}.{now}`");
+        assert!(told.ends_with(&expected), "{told}");
+        assert!(set(&[&format!("{start}.{now}=5")]).is_ok());
+    }
+}
+
+#[test]
 fn the_shipped_file_documents_the_range_of_every_number() {
     let text = include_str!("../../../config/semidense.toml");
     let mut all = Vec::new();
