@@ -16,6 +16,7 @@ use semidense::slam::keyframe::{DepthPoint, Keyframe, KeyframePose};
 use semidense::slam::map::Map;
 use semidense::slam::places::{Description, Feature, FeaturePlace};
 use semidense::slam::pose::{PoseEstimate, TrackingState};
+use semidense::slam::two_frame::MIN_SIDE_PX;
 use semidense::wire::conversion::{
     PoseTiming, keyframe_header, keyframe_image_header, pose_message, rigid_message,
     similarity_message,
@@ -112,6 +113,7 @@ pub fn seeds() -> Vec<Seed> {
         .zip(0..)
         .for_each(|(message, index)| add("message", kind(index, &message)));
     add("pipeline", pipeline());
+    add("pipeline", camera_too_small_for_the_mapper());
     seeds
 }
 
@@ -314,6 +316,14 @@ fn pipeline() -> Vec<u8> {
     bytes.push(3);
     bytes.extend((7..9).flat_map(frame));
     bytes
+}
+
+/// A finding: a start that the tracker accepts and the mapper refuses.
+fn camera_too_small_for_the_mapper() -> Vec<u8> {
+    let (width, height) = (MIN_SIDE_PX as u32, MIN_SIDE_PX as u32 - 1);
+    let small = |sequence| FrameHeader { width, height, stride: width, ..frame_header(sequence) };
+    let frame = |sequence: u64| [vec![4 * sequence as u8], bytes_of(&small(sequence))].concat();
+    (1..4).flat_map(frame).collect()
 }
 
 /// The bytes of a message as in shared memory.

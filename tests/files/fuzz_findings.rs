@@ -1,5 +1,5 @@
 //! The seeds and past findings of fuzzing, run through the same functions as in `fuzz/`: each finding is a file in
-//! `fuzz/findings/TARGET/`.
+//! `fuzz/findings/TARGET/`, or a seed where its format is our own.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -43,12 +43,16 @@ fn every_seed_is_accepted_whole_truncated_and_damaged() {
     assert_eq!(seen.len(), TARGETS.len(), "a target without a seed: {seen:?}");
 }
 
+/// Targets whose input is laid out by our own types: in a file, a finding would test nothing after their next change.
+const OWN_FORMATS: [&str; 5] = ["message", "map", "map_folder", "journal", "pipeline"];
+
 #[test]
 fn past_findings_stay_fixed() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/findings");
     let mut count = 0;
     for (name, run) in TARGETS {
         for entry in fs::read_dir(folder.join(name)).into_iter().flatten().flatten() {
+            assert!(!OWN_FORMATS.contains(&name), "{entry:?}: make it a seed in fuzz/seeds.rs");
             run(&fs::read(entry.path()).unwrap());
             count += 1;
         }
