@@ -30,9 +30,9 @@ use crate::wire::topic::{HEALTH_TOPICS, MAPPER_HEALTH, POSE, Topic};
 
 /// Update period.
 const PERIOD: Duration = Duration::from_secs(1);
-/// The same with `--once`: processes answer a new subscriber within their next frame.
-const ONCE_PERIOD: Duration = Duration::from_millis(50);
-/// Updates after which `--once` prints what it has: a process that hangs or ends does not answer. Three seconds.
+/// The same before the first: processes answer a new subscriber within their next frame.
+const FIRST_PERIOD: Duration = Duration::from_millis(50);
+/// Looks after which the first update shows what it has: a process that hangs or ends does not answer. Three seconds.
 const MAX_LOOKS: usize = 60;
 /// A process that has not reported for longer is stale.
 const STALE_NANOS: i64 = 3_000_000_000;
@@ -101,17 +101,19 @@ fn follow(
 ) -> Result<(), Box<dyn Error>> {
     let hub = Hub::join(place, "status", Access::Observer)?;
     let mut watch = Watch::open(&hub, place)?;
-    let period = if arguments.once { ONCE_PERIOD } else { PERIOD };
+    let mut is_shown = false;
     for looks in 1.. {
+        let period = if is_shown { PERIOD } else { FIRST_PERIOD };
         wait(&[], Some(shutdown.descriptor()), period)?;
         if shutdown.is_requested() {
             break;
         }
         let look = watch.snapshot(&hub)?;
         let has_ended = look["ended"] == true;
-        if arguments.once && looks < MAX_LOOKS && !watch.is_complete(&look) {
+        if !(is_shown || has_ended || looks >= MAX_LOOKS || watch.is_complete(&look)) {
             continue;
         }
+        is_shown = true;
         let text = match arguments.json {
             true => format!("{look}\n"),
             false => status_text(&look, terminal_width()),

@@ -11,9 +11,6 @@ const PERIODS_NANOS: std::ops::RangeInclusive<i64> = 1_000_000..=5_000_000_000;
 /// This many seemingly repeated frames in a row mean a source that has restarted its numbering.
 const RENUMBERED_FRAMES: u32 = 10;
 
-/// Cause that a process reports when its frames have stopped.
-pub const SILENCE: &str = "no frames arrive: check capture";
-
 /// How a frame relates to the previous one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FrameOrderOutcome {

@@ -14,13 +14,14 @@ use crate::service::checkpoint::Kept;
 use crate::service::child::is_supervised;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
-use crate::service::frame_order::{FrameOrder, FrameOrderOutcome, SILENCE};
+use crate::service::frame_order::{FrameOrder, FrameOrderOutcome};
 use crate::service::health::{Health, ProcessState};
 use crate::service::map_folder::session::{MapSession, MapSessionError};
 use crate::service::mapper::output::Output;
 use crate::service::mapper::used_map::UsedMap;
 use crate::service::mode::Mode;
 use crate::service::pairing::Pairing;
+use crate::service::peers::Peer;
 use crate::service::run_error::RunError;
 use crate::service::schedule::{Background, apply};
 use crate::service::shutdown::Shutdown;
@@ -33,8 +34,8 @@ use crate::wire::command::CommandServer;
 use crate::wire::conversion::{code_from_map_state, frame_from_message, pose_from_message};
 use crate::wire::message::{FrameHeader, PoseMessage};
 use crate::wire::place::{Claim, Place};
-use crate::wire::port::{Access, Hub, Received, SendError, Subscriber, wait};
-use crate::wire::topic::{FRAME, MAPPER_HEALTH, POSE};
+use crate::wire::port::{Access, Hub, ReceiveError, Received, SendError, Subscriber, wait};
+use crate::wire::topic::{CAPTURE_HEALTH, FRAME, MAPPER_HEALTH, POSE};
 
 /// Longest sleep between two checks of signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
@@ -81,6 +82,7 @@ struct Shell<'a> {
     commands: Rc<CommandServer>,
     output: Output,
     health: Health,
+    capture: Peer,
     mapper: Option<(Intrinsics, Mapper)>,
     adjustments: Adjustments,
     /// Live: the checkpoint for a successor.
@@ -128,6 +130,7 @@ impl<'a> Shell<'a> {
             commands: Rc::new(CommandServer::open(&hub)?),
             output: Output::open(&hub)?,
             health: Health::open(&hub, &MAPPER_HEALTH)?,
+            capture: Peer::open(&hub, &CAPTURE_HEALTH)?,
             mapper: None,
             adjustments: start_adjustments(config, mode)?,
             kept,
@@ -196,7 +199,7 @@ impl<'a> Shell<'a> {
                 }
             }
             self.answer_commands()?;
-            self.check_for_silence();
+            self.check_for_silence()?;
             self.health.report();
         }
         Ok(())
@@ -244,11 +247,13 @@ impl<'a> Shell<'a> {
     }
 
     /// Live: reports when frames have stopped. The next step ends the state.
-    fn check_for_silence(&mut self) {
+    fn check_for_silence(&mut self) -> Result<(), ReceiveError> {
         let periods = self.config.tracker.stale_periods;
         if self.mode == Mode::Live && self.order.is_silent(self.last_arrival_nanos, periods) {
-            self.health.enter(ProcessState::Stale, SILENCE);
+            let (state, cause) = self.capture.state_in_silence()?;
+            self.health.enter(state, cause);
         }
+        Ok(())
     }
 
     /// Adds one frame to the map and publishes what changed.

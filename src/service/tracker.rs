@@ -6,9 +6,10 @@ use crate::service::budget::IterationCosts;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
 use crate::service::early_wake::Watch;
-use crate::service::frame_order::{FrameOrder, FrameOrderOutcome, SILENCE};
+use crate::service::frame_order::{FrameOrder, FrameOrderOutcome};
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
+use crate::service::peers::Peer;
 use crate::service::reference_feed::ReferenceFeed;
 use crate::service::run_error::RunError;
 use crate::service::schedule::{apply, thread_page_faults};
@@ -25,7 +26,7 @@ use crate::wire::conversion::{
 use crate::wire::message::{FrameHeader, PoseMessage};
 use crate::wire::place::{Claim, Place};
 use crate::wire::port::{Access, Hub, Publisher, ReceiveError, Received, Subscriber, wait};
-use crate::wire::topic::{FRAME, POSE, TRACKER_HEALTH};
+use crate::wire::topic::{CAPTURE_HEALTH, FRAME, POSE, TRACKER_HEALTH};
 
 /// Longest sleep between two checks of signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
@@ -53,6 +54,7 @@ struct Shell<'a> {
     poses: Publisher<PoseMessage, ()>,
     references: ReferenceFeed,
     health: Health,
+    capture: Peer,
     tracker: Option<(Intrinsics, Tracker)>,
     last_intrinsics: Option<Intrinsics>,
     costs: IterationCosts,
@@ -83,6 +85,7 @@ impl<'a> Shell<'a> {
             poses: hub.publisher(&POSE, 1)?,
             references,
             health: Health::open(&hub, &TRACKER_HEALTH)?,
+            capture: Peer::open(&hub, &CAPTURE_HEALTH)?,
             tracker: None,
             last_intrinsics: None,
             costs: IterationCosts::default(),
@@ -111,7 +114,7 @@ impl<'a> Shell<'a> {
                 }
                 next = self.next_frame()?;
             }
-            self.check_for_silence();
+            self.check_for_silence()?;
             self.health.report();
         }
         Ok(())
@@ -245,11 +248,13 @@ impl<'a> Shell<'a> {
     }
 
     /// Live: reports when frames have stopped. The next frame ends the state.
-    fn check_for_silence(&mut self) {
+    fn check_for_silence(&mut self) -> Result<(), ReceiveError> {
         let periods = self.config.tracker.stale_periods;
         if self.mode == Mode::Live && self.order.is_silent(self.last_arrival_nanos, periods) {
-            self.health.enter(ProcessState::Stale, SILENCE);
+            let (state, cause) = self.capture.state_in_silence()?;
+            self.health.enter(state, cause);
         }
+        Ok(())
     }
 
     fn count_page_faults(&mut self) {

@@ -80,7 +80,7 @@ pub const STEP: Topic = Topic { owner: "mapper", noun: "step", subscribers: 6, .
 pub const ADJUSTMENT: Topic = Topic { owner: "mapper", noun: "adjustment", buffer: 64, ..POSE };
 /// Poses of all keyframes.
 pub const GRAPH: Topic = Topic { noun: "graph", ..KEYFRAME };
-/// Health of capture. Every health topic is for capture, supervisor, four observers and some that read it once.
+/// Health of capture. Every health topic is for two of our own processes, supervisor, four observers and some that read it once.
 pub const CAPTURE_HEALTH: Topic = Topic {
     owner: "capture",
     noun: "health",

@@ -47,6 +47,11 @@ fn watching_continues_past_the_ends_of_runs_with_an_object_per_line() {
         let child = rig.run(60, &["--live", "--source", "loop:1000000:15:sim"]).spawn().unwrap();
         let on = until(&said, |value| value["tracker"]["frames"].as_u64() > Some(5));
         assert_eq!((&on["ended"], &on["instance"]), (&false.into(), &"semidense".into()));
+        let mut late = rig.command(&["status", "--json"]).spawn().unwrap();
+        let first = next(&lines(&mut late));
+        assert!(first["pose"].is_object(), "the first update lacks the pose: {first}");
+        signal(&late, Signal::INT);
+        end(late);
         signal(&child, Signal::INT);
         assert_eq!(end(child).status.code(), Some(130));
         let off = until(&said, |value| value["ended"] == true);
