@@ -193,6 +193,7 @@ fn journal() -> Vec<u8> {
         config: "instance = \"rig\"\n".to_owned(),
         poses_given: false,
         is_depth_from_sensor: false,
+        first_keyframe_id: 0,
         began_nanos: 1,
     };
     let map_from_keyframe = Sim3::new(SE3::identity(), 2.0);

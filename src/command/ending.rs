@@ -17,6 +17,7 @@ use crate::service::journal::log::RunStart;
 use crate::service::journal::{Journal, JournalOptions};
 use crate::service::map_folder::map_folder_error::MapFolderError;
 use crate::service::map_folder::reading::read_manifest;
+use crate::service::map_folder::session::first_own_id;
 use crate::service::results::Results;
 use crate::service::results::calibration::calibration_warning;
 use crate::service::results::empty_map::empty_map_warning;
@@ -233,6 +234,7 @@ pub fn journal_options(
         config: config.to_text(),
         poses_given: false,
         is_depth_from_sensor: false,
+        first_keyframe_id: first_own_id(&config.map),
         began_nanos: since.map_or(0, |since| since.as_nanos() as u64),
     };
     let max_depth_bytes = config.mapping.max_map_bytes() as u64;

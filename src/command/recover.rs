@@ -221,8 +221,9 @@ fn record_of(
         deadline_ms: config.tracker.deadline_ms,
         counters: recovered.counters,
     };
+    let (ended, first_keyframe_id) = (recovered.ended, start.first_keyframe_id);
     let record = recovered.recording.into_record(parts);
-    RunRecord { ended: EndOfRun::Recovered(recovered.ended), ..record }
+    RunRecord { ended: EndOfRun::Recovered(ended), first_keyframe_id, ..record }
 }
 
 /// A source that no longer exists, or never had ground truth.

@@ -257,6 +257,7 @@ impl<'a> Replay<'a> {
         if let Some(map) = &mut map {
             map.begin(&mut mapper, &intrinsics, None)?;
         }
+        let first_keyframe_id = mapper.free_keyframe_id();
         Ok(Self {
             config,
             width: intrinsics.width,
@@ -271,6 +272,7 @@ impl<'a> Replay<'a> {
                 is_depth_from_sensor: config.initial_depth == DepthOrigin::Sensor,
                 depth_scale: if given { DepthScale::Given } else { DepthScale::MedianRatio },
                 ground_truth,
+                first_keyframe_id,
                 rejections: Some(Vec::new()),
                 ..RunRecord::empty(RunMode::Replay, source_name)
             },

@@ -68,6 +68,27 @@ fn a_map_loaded_on_request_is_not_graded_as_a_broken_one() {
 }
 
 #[test]
+fn keyframes_of_earlier_runs_are_not_compared() {
+    const VARIANCES: [usize; 6] = [0, 6, 11, 15, 18, 20];
+    let certain = |i| {
+        let mut pose = pose(i, TrackingState::Tracking, u64::from(i >= 40));
+        VARIANCES.iter().for_each(|&at| pose.estimate.covariance[at] = 1e-4);
+        pose
+    };
+    let record = record((0..60).map(certain).collect(), vec![keyframe(0), keyframe(1)], true);
+    for (first_keyframe_id, frames, pixels) in [(0, 60, 40), (1, 20, 20)] {
+        let record = RunRecord { first_keyframe_id, ..record.clone() };
+        let folder = tempfile::tempdir().unwrap();
+        let (summary, _) = written(&folder.path().join("out"), &record);
+        assert_eq!(summary["keyframes"], 2, "of the map");
+        assert_eq!(
+            (&summary["nees_frames"], &summary["depth_pixels"]),
+            (&frames.into(), &pixels.into())
+        );
+    }
+}
+
+#[test]
 fn figures_and_files_of_a_run_with_truth_and_a_loss() {
     let state = |i| match i {
         0..3 => TrackingState::Initializing,

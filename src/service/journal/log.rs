@@ -50,6 +50,9 @@ pub struct RunStart {
     /// Whether keyframes took their first depth from the source's depth camera.
     #[serde(default)]
     pub is_depth_from_sensor: bool,
+    /// First id of a keyframe made in the run.
+    #[serde(default)]
+    pub first_keyframe_id: u64,
     /// Start time, nanoseconds since 1970: two runs may begin in one second.
     pub began_nanos: u64,
 }
@@ -248,6 +251,7 @@ mod tests {
             config: "instance = \"x\"\n".into(),
             poses_given: false,
             is_depth_from_sensor: true,
+            first_keyframe_id: 3,
             began_nanos: 5,
         };
         let frame = FrameView {

@@ -176,6 +176,7 @@ mod tests {
             config: String::new(),
             poses_given: false,
             is_depth_from_sensor: false,
+            first_keyframe_id: 0,
             began_nanos: 0,
         };
         let mut found = Recovered::of(start);

@@ -162,6 +162,14 @@ pub fn check_camera(config: &MapConfig, camera: &Intrinsics) -> Result<(), MapFo
     }
 }
 
+/// First id of a keyframe of a run that begins now: above those of earlier runs in its map.
+pub fn first_own_id(config: &MapConfig) -> u64 {
+    let manifest = (!config.folder.is_empty()).then(|| read_manifest(Path::new(&config.folder)));
+    let Some(Ok((manifest, _))) = manifest else { return 0 };
+    let ids = manifest.keyframes.iter().map(|listed| listed.keyframe.keyframe_id);
+    ids.max().map_or(0, |newest| newest.saturating_add(1))
+}
+
 /// Checks that a folder holds a map of this camera that a running mapper could switch to.
 pub fn check_loadable(folder: &Path, camera: &Intrinsics) -> Result<(), MapFolderError> {
     let (manifest, _) = read_manifest(folder)?;

@@ -5,7 +5,9 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use super::*;
+use crate::service::config::MapConfig;
 use crate::service::map_folder::reading::{BEFORE, KEYFRAMES, MANIFEST, load};
+use crate::service::map_folder::session::first_own_id;
 use crate::service::map_folder::writer::{MapHead, MapWriter};
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
@@ -82,6 +84,25 @@ fn a_map_is_read_back_bit_for_bit() {
     assert_eq!((loaded.map.revision, loaded.map.free_epoch), (6, 4));
     assert_eq!((loaded.problems.len(), loaded.without_memory), (0, 0));
     assert_eq!(contents(folder.path()), before, "reading changes nothing");
+}
+
+#[test]
+fn ids_of_a_run_are_above_those_of_earlier_runs() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = |path: &Path| MapConfig {
+        folder: path.to_str().unwrap().to_owned(),
+        ..MapConfig::default()
+    };
+    let here = config(folder.path());
+    assert_eq!((first_own_id(&MapConfig::default()), first_own_id(&here)), (0, 0));
+    let keyframes: Vec<Keyframe> = (0..5).map(|id| keyframe(id * 3, 1)).collect();
+    save(&mut open(folder.path()), &keyframes);
+    assert_eq!(first_own_id(&here), 13);
+    // What the results take for the first is the first that the mapper makes.
+    let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+    let loaded = load(folder.path(), ALL).unwrap().map;
+    mapper.start_in_map(loaded, MapUse::Extend).unwrap();
+    assert_eq!(mapper.free_keyframe_id(), 13);
 }
 
 #[test]

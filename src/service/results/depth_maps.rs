@@ -6,14 +6,14 @@ use crate::service::results::record::RunRecord;
 use crate::slam::evaluation::depth_error::DepthErrors;
 use crate::slam::keyframe::{Keyframe, MapState};
 
-/// Compares every established keyframe with true depth in one epoch, which has one unit.
+/// Compares every established keyframe of the run with true depth in one epoch, which has one unit.
 pub fn evaluate_depth(
     record: &RunRecord,
     epoch: Option<u32>,
     source: &mut dyn FrameSource,
 ) -> Result<DepthErrors, SourceError> {
     let mut errors = DepthErrors::default();
-    let of_epoch = record.map.keyframes.iter().filter(|k| Some(k.epoch) == epoch);
+    let of_epoch = record.own_keyframes().iter().filter(|k| Some(k.epoch) == epoch);
     for keyframe in of_epoch.filter(|k| is_evaluated(k)) {
         let true_depth = match source.depth_at(keyframe.capture_nanos) {
             // One damaged file must not cost the results.

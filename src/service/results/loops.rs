@@ -29,12 +29,12 @@ pub struct LoopSummary {
     pub loops_refused: Option<u64>,
     /// CPU time of a search.
     pub loop_search_ms: Option<Percentiles>,
-    /// CPU time of all searches per keyframe of the map, milliseconds.
+    /// CPU time of all searches per keyframe of the run, milliseconds.
     pub loop_search_ms_per_keyframe: Option<f64>,
 }
 
 impl LoopSummary {
-    /// Summarises the searches of a run whose map has `keyframes` keyframes.
+    /// Summarises the searches of a run that made `keyframes` keyframes.
     pub fn of(records: Option<&[SearchRecord]>, keyframes: usize) -> Self {
         let Some(records) = records else { return Self::default() };
         let count = |is: fn(&SearchOutcome) -> bool| {

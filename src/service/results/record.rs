@@ -10,6 +10,7 @@ use crate::service::alignment_stamps::AlignmentTrace;
 use crate::service::results::budget_curve::BudgetSample;
 use crate::service::time_counts::TimeCounts;
 use crate::slam::evaluation::depth_error::DepthScale;
+use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::mapper::situation::StartFrame;
@@ -117,6 +118,8 @@ pub struct RunRecord {
     pub map: Map,
     /// The map that was loaded on request during the run.
     pub loaded_map: Option<LoadedMap>,
+    /// First id of a keyframe made in this run: those below are of earlier runs in its map.
+    pub first_keyframe_id: u64,
     /// True poses in order of their stamps, empty where there are none.
     pub ground_truth: Vec<StampedPose>,
     /// Source of the metric scale when depth is compared.
@@ -179,5 +182,11 @@ impl RunRecord {
     /// The record of a run that has not begun.
     pub fn empty(mode: RunMode, source: &str) -> Self {
         Self { mode, source: source.to_owned(), ..Self::default() }
+    }
+
+    /// The keyframes made in this run; what it is compared with knows nothing of earlier runs. Ids ascend.
+    pub fn own_keyframes(&self) -> &[Keyframe] {
+        let (all, first) = (&self.map.keyframes, self.first_keyframe_id);
+        &all[all.partition_point(|keyframe| keyframe.keyframe_id < first)..]
     }
 }

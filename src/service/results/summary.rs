@@ -378,7 +378,7 @@ impl Summary {
             frames_skipped_by_mapper: record.frames_skipped_by_mapper,
             times: StepTimes::of(record),
             joint: JointSummary::of(&record.adjustments),
-            loops: LoopSummary::of(record.searches.as_deref(), record.map.keyframes.len()),
+            loops: LoopSummary::of(record.searches.as_deref(), record.own_keyframes().len()),
             budget_curve: BudgetCurve::of(&record.budget_samples),
             recorded_secs,
             wall_secs,
@@ -420,7 +420,7 @@ pub fn without_depth(map: &Map) -> u64 {
 
 /// The grade of a run.
 fn grade(record: &RunRecord) -> Grade {
-    let keyframes = &record.map.keyframes;
+    let keyframes = record.own_keyframes();
     let sequences = record.poses.iter().map(|pose| pose.estimate.sequence);
     let (first, last) = (sequences.clone().min(), sequences.max());
     let frames = last.zip(first).map_or(0, |(last, first)| last - first + 1);
@@ -435,7 +435,7 @@ fn grade(record: &RunRecord) -> Grade {
         are_poses_given: record.depth_scale == DepthScale::Given,
         rejections: record.rejections.as_ref().map_or(0, |all| all.len() as u64),
         frames,
-        width: keyframes.first().map_or(0, |keyframe| keyframe.intrinsics.width),
+        width: record.map.keyframes.first().map_or(0, |keyframe| keyframe.intrinsics.width),
         consistency: MapConsistency::measure(keyframes),
     })
 }
