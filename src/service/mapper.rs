@@ -157,22 +157,10 @@ impl<'a> Shell<'a> {
         let (max_bytes, numbering) = (self.config.mapping.max_map_bytes(), self.used.numbering);
         let waits = self.mode == Mode::Lockstep;
         let open = || MapSession::open(&map, max_bytes, numbering, waits);
-        let session = self.report_while(open).unwrap_or_else(|panic| resume_unwind(panic));
+        let session = report_while(&mut self.health, &self.pool, open)
+            .unwrap_or_else(|panic| resume_unwind(panic));
         self.map = session.map_err(MapSessionError::from)?;
         Ok(())
-    }
-
-    /// Does something slow in the pool while signs of life continue; an error is its panic.
-    fn report_while<T: Send>(&mut self, slow: impl FnOnce() -> T + Send) -> thread::Result<T> {
-        let (health, pool) = (&mut self.health, &self.pool);
-        thread::scope(|scope| {
-            let running = scope.spawn(|| pool.install(slow));
-            while !running.is_finished() {
-                health.report();
-                thread::sleep(LOADING_PAUSE);
-            }
-            running.join()
-        })
     }
 
     /// Writes what the map on disk lacks.
@@ -381,6 +369,22 @@ impl<'a> Shell<'a> {
     }
 }
 
+/// Does something slow in the pool while signs of life continue; an error is its panic.
+fn report_while<T: Send>(
+    health: &mut Health,
+    pool: &rayon::ThreadPool,
+    slow: impl FnOnce() -> T + Send,
+) -> thread::Result<T> {
+    thread::scope(|scope| {
+        let running = scope.spawn(|| pool.install(slow));
+        while !running.is_finished() {
+            health.report();
+            thread::sleep(LOADING_PAUSE);
+        }
+        running.join()
+    })
+}
+
 /// Publishes and counts finished joint estimates; reports when there will be no more.
 fn publish_adjustments(
     adjustments: &mut Adjustments,
@@ -427,4 +431,28 @@ fn start_adjustments(config: &Config, mode: Mode) -> Result<Adjustments, RunErro
 /// Nanoseconds since an instant of CLOCK_MONOTONIC.
 fn nanos_since(begin: i64) -> u64 {
     u64::try_from(now_nanos() - begin).unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_map_that_takes_long_to_read_leaves_the_mapper_alive() {
+        let folder = tempfile::tempdir_in("/tmp").unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        let hub = Hub::join(&place, "mapper", Access::Member).unwrap();
+        let mut health = Health::open(&hub, &MAPPER_HEALTH).unwrap();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        // Reads until its reader has heard of it, which is to be long before this ends.
+        let read = || {
+            let hub = Hub::join(&place, "reader", Access::Observer).unwrap();
+            let mut mapper = Peer::open(&hub, &MAPPER_HEALTH).unwrap();
+            (0..1000).any(|_| {
+                thread::sleep(Duration::from_millis(10));
+                mapper.update().unwrap().is_some()
+            })
+        };
+        assert!(report_while(&mut health, &pool, read).unwrap(), "no sign of life");
+    }
 }

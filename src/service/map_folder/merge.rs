@@ -59,8 +59,27 @@ fn joined(first: Map, second: Map) -> Map {
 mod tests {
     use super::*;
     use crate::service::loop_bytes::tests::loops;
+    use crate::service::map_folder::depth_file::MapDetail;
+    use crate::service::map_folder::manifest::Manifest;
     use crate::slam::geometry::intrinsics::Intrinsics;
     use crate::slam::geometry::sim3::Sim3;
+
+    #[test]
+    fn maps_of_two_cameras_are_refused_by_name() {
+        let empty = |fx: f64| {
+            let manifest = Manifest::new(Intrinsics::pinhole(64, 48, fx), MapDetail::Full);
+            Loaded { manifest, map: Map::default(), without_memory: 0, problems: Vec::new() }
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let merged = folder.path().join("merged");
+        let told = merge(&merged, [60.0, 61.0].map(empty), [Path::new("one"), Path::new("other")]);
+        assert_eq!(
+            told.unwrap_err().to_string(),
+            "one and other are maps of different cameras (64x48, fx 60.000, fy 60.000, cx 31.500, cy 23.500 and 64x48, \
+             fx 61.000, fy 61.000, cx 31.500, cy 23.500): only maps of one camera and its calibration can be merged"
+        );
+        assert!(!merged.exists());
+    }
 
     #[test]
     fn merged_maps_share_no_numbers() {

@@ -13,7 +13,7 @@ use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::save_copy;
 use crate::service::map_folder::session::{MapSession, check_loadable};
 use crate::service::mapper::used_map::UsedMap;
-use crate::service::mapper::{Shell, WRITES_MAP, publish_adjustments};
+use crate::service::mapper::{Shell, WRITES_MAP, publish_adjustments, report_while};
 use crate::service::mode::Mode;
 use crate::service::run_error::RunError;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -141,7 +141,8 @@ impl Shell<'_> {
                 _ => Err(format!("{}: no keyframe to relocalise against", map.folder)),
             }
         };
-        self.report_while(begin).unwrap_or_else(|_| Err("reading the map has failed".to_owned()))
+        report_while(&mut self.health, &self.pool, begin)
+            .unwrap_or_else(|_| Err("reading the map has failed".to_owned()))
     }
 
     /// Notes the other map for the run's results and, live, for a successor, which does not begin with what was left of

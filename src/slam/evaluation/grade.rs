@@ -251,7 +251,12 @@ mod tests {
                 GradeLevel::Doubtful,
             ),
             (GradeInput { frames_lost: 30, losses: 1, ..good }, "lost once", GradeLevel::Poor),
-            (GradeInput { epochs: 3, ..good }, "3 separate parts", GradeLevel::Doubtful),
+            (GradeInput { epochs: 3, ..good }, "each with its own scale", GradeLevel::Doubtful),
+            (
+                GradeInput { epochs: 3, are_poses_given: true, ..good },
+                "3 separate parts, depth was restarted in each",
+                GradeLevel::Doubtful,
+            ),
             (
                 GradeInput { rejections: 1, ..good },
                 "contradicted itself once",
