@@ -385,3 +385,37 @@ fn is_readable(descriptor: BorrowedFd<'_>) -> bool {
     let now = Timespec { tv_sec: 0, tv_nsec: 0 };
     rustix::event::poll(&mut polled, Some(&now)).is_ok_and(|ready| ready > 0)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use semidense::slam::frame::FrameView;
+    use semidense::slam::pose::PoseEstimate;
+    use semidense::wire::conversion::{PoseTiming, pose_message};
+    use semidense::wire::port::Publisher;
+
+    #[test]
+    fn a_wait_consumes_the_wakes_of_all_topics_and_of_no_other_reader() {
+        let folder = tempfile::tempdir_in("/tmp").unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        let hub = Hub::join(&place, "tracker", Access::Member).unwrap();
+        let poses: Publisher<PoseMessage, ()> = hub.publisher(&POSE, 1).unwrap();
+        let frames: Publisher<u8, FrameHeader> = hub.publisher(&FRAME, 1).unwrap();
+        let health = HEALTH_TOPICS.map(|topic| Peer::open(&hub, &topic).unwrap());
+        let wanted = wants::POSES | wants::FRAMES;
+        let [mut first, second] = [(); 2].map(|()| Reader::join(&place, wanted).unwrap());
+        let num_awake =
+            |reader: &Reader| reader.events().filter(|events| is_readable(events.as_fd())).count();
+        let (width, height, pixels) = (1, 1, &[0][..]);
+        let (sequence, capture_nanos, exposure_nanos) = (0, 0, 0);
+        let view = FrameView { sequence, capture_nanos, exposure_nanos, width, height, pixels };
+        let pose = pose_message(&PoseEstimate::unknown(&view), &PoseTiming::default());
+        poses.send((), &[pose]).unwrap();
+        frames.send(FrameHeader::default(), pixels).unwrap();
+        assert_eq!((num_awake(&first), num_awake(&second)), (2, 2));
+        assert!(first.wait(Some(Duration::from_secs(10))).is_ok_and(|status| status == Status::Ok));
+        assert_eq!((num_awake(&first), num_awake(&second)), (0, 2));
+        drop((first, second, poses, frames, health, hub));
+        place.tidy();
+    }
+}

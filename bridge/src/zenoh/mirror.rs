@@ -168,3 +168,38 @@ impl Mirror {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use semidense::service::peers::Peer;
+    use semidense::wire::topic::TRACKER_HEALTH;
+
+    #[test]
+    fn a_finished_process_stays_finished_for_three_seconds_and_is_stale_then() {
+        let folder = tempfile::tempdir_in("/tmp").unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        let mut mirror = Mirror::open(&place).unwrap();
+        let hub = Hub::join(&place, "reader", Access::Observer).unwrap();
+        let mut tracker = Peer::open(&hub, &TRACKER_HEALTH).unwrap();
+        let finished =
+            HealthMessage { state: ProcessState::Finished.code(), ..HealthMessage::new_zeroed() };
+        mirror.publish(&Arrival::Health(Kind::TrackerHealth, Box::new(finished))).unwrap();
+        // By the age of its last report; a second is left for a slow machine.
+        let expected = [
+            (REPORT_PERIOD_NANOS, ProcessState::Finished),
+            (END_PERIOD_NANOS - REPORT_PERIOD_NANOS, ProcessState::Finished),
+            (END_PERIOD_NANOS, ProcessState::Stale),
+        ];
+        for (age_nanos, state) in expected {
+            let reported = &mut mirror.health[1];
+            reported.heard_nanos = now_nanos() - age_nanos;
+            reported.told_nanos = i64::MIN;
+            mirror.report_silence("the link is gone").unwrap();
+            tracker.update().unwrap();
+            assert_eq!(tracker.state(), Some(state), "{age_nanos}");
+        }
+        drop((tracker, hub, mirror));
+        place.tidy();
+    }
+}
