@@ -130,6 +130,8 @@ pub struct Memory {
     velocity: VelocityMemory,
     brightness: Brightness,
     last_sequence: Option<u64>,
+    /// Highest id of a keyframe so far: ids ascend over all epochs.
+    newest_keyframe_id: u64,
     /// Whether the previous frame was not tracked on a keyframe.
     was_lost: bool,
     /// Covariance of the last estimate.
@@ -168,7 +170,7 @@ impl Tracker {
         &mut self.turning.unknown.scratch
     }
 
-    /// Makes a prepared reference the active one and returns the previous one, for its memory. The first one of a later
+    /// Makes a prepared reference the active one and returns the previous one, for its memory. The first one of a new
     /// epoch resets the camera's motion.
     pub fn adopt(&mut self, reference: Box<Reference>) -> Option<Box<Reference>> {
         /// Frames by which a mapper may lag with the first keyframe of an epoch: ten seconds at 30 Hz.
@@ -176,9 +178,11 @@ impl Tracker {
         let before = self.reference.replace(reference);
         let (old, new) = (before.as_deref(), self.reference.as_deref());
         if let (Some(old), Some(new)) = (old, new) {
-            // A keyframe whose epoch was joined to another has a new epoch number but the same pose, and an earlier
-            // epoch that is resumed is placed where the odometry has the camera.
-            if old.epoch() < new.epoch() && old.keyframe_id() != new.keyframe_id() {
+            // A keyframe whose epoch was joined to another has a new epoch number but the same pose, and an epoch that
+            // is resumed is placed where the odometry has the camera.
+            let newest = self.memory.newest_keyframe_id.max(old.keyframe_id());
+            self.memory.newest_keyframe_id = newest.max(new.keyframe_id());
+            if old.epoch() < new.epoch() && new.keyframe_id() > newest {
                 self.memory.motion = Motion::default();
                 self.memory.velocity.forget();
                 // On a keyframe that was not created just now, but belongs to a map that the mapper switched to, the

@@ -302,31 +302,40 @@ fn without_a_trusted_keyframe_nothing_is_claimed() {
 }
 
 #[test]
-fn a_camera_found_after_a_rejected_map_is_where_it_was_before() {
+fn a_camera_found_again_is_where_it_was_before() {
     let (plane, camera) = (small_plane(), small_camera());
-    let keyframe = plane.keyframe(&camera, 2, 0.02);
-    let mut tracker = tracker_on(&keyframe);
+    let keyframe = Keyframe { keyframe_id: 7, ..plane.keyframe(&camera, 2, 0.02) };
     let seen = |index: u64, pose: &SE3| plane.render(&camera, pose, 2.0, (1.0, 0.0), index);
-    let before = tracker.track(&frame(1, &seen(1, &path(1))), &mut always).world_from_camera;
-    // On a keyframe that is elsewhere the same view would be another pose.
-    let elsewhere = Sim3::new(SE3::exp(&Vector6::new(0.4, 0.0, 0.0, 0.0, 0.0, 1.0)), 1.0);
-    let rejected = Keyframe {
-        keyframe_id: 7,
-        map_state: MapState::Rejected,
-        world_from_keyframe: elsewhere,
-        ..keyframe.clone()
-    };
-    tracker.adopt(Box::new(Reference::prepare(&rejected)));
-    let estimate = tracker.track(&frame(2, &seen(2, &path(2))), &mut always);
-    assert_eq!(estimate.state, TrackingState::Lost(LostReason::MapRejected));
-    assert_eq!(estimate.world_from_camera, before);
-    // The camera is found rolled by 40° against a keyframe, which is placed such that it keeps its pose.
+    // Rolled by 40° against a keyframe, which is placed such that the camera keeps its pose.
     let found = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, 0.7));
-    let anchored = Sim3::new(before * found.inverse(), 1.0);
-    let restored = Keyframe { keyframe_id: 3, world_from_keyframe: anchored, ..keyframe };
-    tracker.adopt(Box::new(Reference::prepare(&restored)));
-    let estimate = tracker.track(&frame(3, &seen(3, &found)), &mut always);
-    assert_eq!(estimate.state, TrackingState::Tracking);
+    // A keyframe is newer than all others where a later epoch begins, and older where it is resumed.
+    for (is_rejected, keyframe_id, epoch, state) in [
+        (false, 3, 1, TrackingState::Tracking),
+        (false, 9, 1, TrackingState::Lost(LostReason::TooFewInliers)),
+        (true, 3, 0, TrackingState::Tracking),
+    ] {
+        let mut tracker = tracker_on(&keyframe);
+        let before = tracker.track(&frame(1, &seen(1, &path(1))), &mut always).world_from_camera;
+        if is_rejected {
+            // On a keyframe that is elsewhere the same view would be another pose.
+            let elsewhere = Sim3::new(SE3::exp(&Vector6::new(0.4, 0.0, 0.0, 0.0, 0.0, 1.0)), 1.0);
+            let rejected = Keyframe {
+                keyframe_id: 8,
+                map_state: MapState::Rejected,
+                world_from_keyframe: elsewhere,
+                ..keyframe.clone()
+            };
+            tracker.adopt(Box::new(Reference::prepare(&rejected)));
+            let estimate = tracker.track(&frame(2, &seen(2, &path(2))), &mut always);
+            assert_eq!(estimate.state, TrackingState::Lost(LostReason::MapRejected));
+            assert_eq!(estimate.world_from_camera, before);
+        }
+        let world_from_keyframe = Sim3::new(before * found.inverse(), 1.0);
+        let at = Keyframe { keyframe_id, epoch, world_from_keyframe, ..keyframe.clone() };
+        tracker.adopt(Box::new(Reference::prepare(&at)));
+        let estimate = tracker.track(&frame(3, &seen(3, &found)), &mut always);
+        assert_eq!(estimate.state, state, "{keyframe_id}");
+    }
 }
 
 #[test]
