@@ -1,14 +1,17 @@
 //! Collects what a run publishes until its results are written, and keeps its journal.
 
+use std::io;
+
 use crate::service::adjustments::message::adjustment_from_message;
-use crate::service::journal::Journal;
 use crate::service::journal::feed::KeyframeFeed;
 use crate::service::journal::log::{Record, Step};
 use crate::service::journal::recovered::complete;
+use crate::service::journal::{Journal, JournalOptions};
 use crate::service::recording::{RecordParts, Recording, RunCounters};
 use crate::service::results::record::RunRecord;
 use crate::slam::map::Map;
 use crate::wire::message::{AdjustmentMessage, PoseMessage, StepMessage};
+use crate::wire::place::Place;
 use crate::wire::port::{Events, Hub, OpenError, ReceiveError, Subscriber};
 use crate::wire::topic::{ADJUSTMENT, POSE, STEP};
 
@@ -28,8 +31,19 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Subscribes from now on; messages go into the journal too, if there is one.
-    pub fn open(hub: &Hub, journal: Option<Journal>) -> Result<Self, OpenError> {
+    /// Subscribes from now on; messages go into the journal too, without which the run continues where it cannot begin.
+    pub fn open(
+        hub: &Hub,
+        journal: Option<&JournalOptions>,
+        place: &Place,
+    ) -> Result<Self, OpenError> {
+        let warn = |error: &io::Error| {
+            tracing::warn!(
+                "no journal is kept ({error}); if this process is killed, the run is lost"
+            );
+        };
+        let journal =
+            journal.and_then(|options| Journal::begin(options, place).inspect_err(warn).ok());
         let keyframes = journal.is_some().then(|| KeyframeFeed::open(hub)).transpose()?;
         Ok(Self {
             poses: hub.subscriber(&POSE)?,

@@ -164,17 +164,6 @@ fn supervise(
     Ok(RunOutcome { record, journal, source })
 }
 
-/// Begins the journal of the run, which continues without one.
-fn begin_journal(options: &RunOptions, place: &Place) -> Option<Journal> {
-    Journal::begin(options.journal.as_ref()?, place)
-        .inspect_err(|error| {
-            tracing::warn!(
-                "no journal is kept ({error}); if this process is killed, the run is lost"
-            )
-        })
-        .ok()
-}
-
 /// The claim of the supervisor, after a check that none of the three runs already.
 fn claim_all(place: &Place) -> Result<Claim, RunError> {
     let claim = place.claim("supervisor")?;
@@ -226,7 +215,7 @@ impl<'a> Supervisor<'a> {
             run: format!("{}-{}", std::process::id(), now_nanos()),
             frames: memory_for_frames(&options.source, options.mode),
             processes,
-            recorder: Recorder::open(&hub, begin_journal(options, place))?,
+            recorder: Recorder::open(&hub, options.journal.as_ref(), place)?,
             commands: CommandClient::open(&hub)?,
             hub,
             of_ended: RunCounters::default(),
