@@ -15,6 +15,7 @@ use crate::command::print::{note, print};
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::report::evaluation_plot::evaluation_plot;
 use crate::service::trajectory_file::{TrajectoryFile, read_trajectory_file};
+use crate::slam::evaluation::EvaluationError;
 use crate::slam::evaluation::epochs::evaluate_epochs;
 use crate::slam::evaluation::umeyama::TrajectoryAlignment;
 use crate::slam::trajectory::{EpochPose, StampedPose, by_epoch};
@@ -89,7 +90,12 @@ pub fn run(args: &EvaluateArgs) -> Result<ExitCode, Box<dyn Error>> {
     let max_difference_nanos = (args.max_difference * 1e9).round() as i64;
     let evaluation = evaluate_epochs(&estimate.poses, &truth, alignment, max_difference_nanos)
         .map_err(|error| {
-            format!("{} against {}: {error}", args.estimate.display(), args.truth.display())
+            use EvaluationError::{OneMatch, TooFewMatches};
+            let option = match error {
+                TooFewMatches { .. } | OneMatch { .. } => " (--max-difference)",
+                _ => "",
+            };
+            format!("{} against {}: {error}{option}", args.estimate.display(), args.truth.display())
         })?;
     if let Some(path) = &args.plot {
         let svg = evaluation_plot(&evaluation, &truth);

@@ -17,7 +17,7 @@ use crate::service::error_log::ErrorLog;
 use crate::service::final_map::{FinalMapError, final_map};
 use crate::service::health::{ProcessState, cause};
 use crate::service::journal::{Journal, JournalOptions};
-use crate::service::map_folder::session::{MapSessionError, check_camera, first_own_id};
+use crate::service::map_folder::session::{MapSessionError, check_camera};
 use crate::service::mapper::used_map::loaded_map;
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
@@ -110,7 +110,6 @@ fn supervise(
     shutdown: &Shutdown,
     observe: &mut dyn FnMut(&RunProgress),
 ) -> Result<RunOutcome, RunError> {
-    let first_keyframe_id = first_own_id(&config.map);
     let mut supervisor = Supervisor::start(config, options, place)?;
     let mut ended = supervisor.watch(shutdown, observe)?;
     supervisor.stop(CAPTURE, shutdown);
@@ -159,6 +158,7 @@ fn supervise(
         counters,
     });
     let loaded_map = loaded_map(place);
+    let first_keyframe_id = options.journal.as_ref().map_or(0, |kept| kept.start.first_keyframe_id);
     let record =
         RunRecord { ended, refused, restart_causes, loaded_map, first_keyframe_id, ..record };
     Ok(RunOutcome { record, journal, source })

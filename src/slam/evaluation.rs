@@ -50,7 +50,7 @@ pub enum EvaluationError {
     },
     /// Too few poses have ground truth near their stamps.
     #[error(
-        "only {found} of {estimated} poses have ground truth within {max_difference_secs} s (at least {needed} are needed){}: check that both use the same clock and unit, or allow a larger --max-difference",
+        "only {found} of {estimated} poses have ground truth within {max_difference_secs} s (at least {needed} are needed){}: check that both use the same clock and unit, or allow a larger difference",
         next_text(*next_secs)
     )]
     TooFewMatches {
@@ -68,7 +68,7 @@ pub enum EvaluationError {
     },
     /// All matches are with the same pose.
     #[error(
-        "all {found} matched poses of the {of} are matched with the same pose of the {only}, within {max_difference_secs} s: check that both use the same clock and unit, or allow a smaller --max-difference"
+        "all {found} matched poses of the {of} are matched with the same pose of the {only}, within {max_difference_secs} s: check that both use the same clock and unit, or allow a smaller one"
     )]
     OneMatch {
         /// Matches found.
@@ -257,7 +257,7 @@ mod tests {
         let error = evaluate(&late, &truth[..30]).unwrap_err().to_string();
         assert!(error.starts_with("only 0 of 40 poses"), "{error}");
         assert!(error.contains(", the next is 4.053733343 s away: "), "{error}");
-        assert!(error.ends_with("or allow a larger --max-difference"), "{error}");
+        assert!(error.ends_with("or allow a larger difference"), "{error}");
         let mut broken = truth.clone();
         broken[7].world_from_camera.translation.x = f64::NAN;
         let error = evaluate(&broken, &truth).unwrap_err();

@@ -109,7 +109,7 @@ impl Shell<'_> {
         let (session, mut next) = self.start_in_map(&map, &camera, numbering)?;
         self.save_map_folder()?;
         self.used = UsedMap { switched_to: Some(map), numbering, ..self.used.clone() };
-        self.forget_checkpoint()?;
+        self.note_loaded_map()?;
         if let Some((_, before)) = self.mapper.take() {
             next.replace_mapper(before);
         }
@@ -147,13 +147,11 @@ impl Shell<'_> {
 
     /// Notes the other map for the run's results and, live, for a successor, which does not begin with what was left of
     /// this one.
-    fn forget_checkpoint(&mut self) -> Result<(), String> {
+    fn note_loaded_map(&mut self) -> Result<(), String> {
         let (path, note) = (self.place.checkpoint_path(), self.place.loaded_map_path());
-        let kept = self.kept.take();
-        let is_kept = kept.is_some();
-        kept.into_iter().for_each(|mut kept| kept.remove_on_drop());
+        let dropped = self.kept.take().map(|mut kept| kept.remove_on_drop());
         let written = self.used.write(&note);
-        if is_kept {
+        if dropped.is_some() {
             self.kept = Kept::open(&path).0;
             self.kept.iter_mut().for_each(Kept::reserve);
         }

@@ -244,7 +244,8 @@ pub struct Summary {
     pub untracked: Option<String>,
     /// Keyframes of the final map.
     pub keyframes: u64,
-    /// Those of them without depth: the oldest of a long run, those of a map before `map load`, or those that a recovery could not find.
+    /// Those of them without depth: the oldest of a long run, those of a map before `map load`, or those that a
+    /// recovery could not find.
     pub keyframes_without_depth: u64,
     /// Their points, and those of `map.ply`.
     #[serde(flatten)]

@@ -26,7 +26,7 @@ impl Mapper {
         self.last_world_from_camera = before.last_world_from_camera;
     }
 
-    /// Follows odometry, also while the camera is tracked on an earlier keyframe than the active one.
+    /// Follows odometry, also on a keyframe of the map before this one, or on an earlier one than the active.
     pub(super) fn follow_odometry(&mut self, pose: &PoseEstimate) {
         if pose.state.is_tracked() && pose.world_from_camera.is_finite() {
             self.last_world_from_camera = Some(pose.world_from_camera);
