@@ -2,7 +2,7 @@
 //! the range that a negative number misses.
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
-use clap::{Arg, ArgMatches, Command, Error, Parser};
+use clap::{Arg, Command, Error, Parser};
 
 /// Parses the command line; prints help, version or an error and ends the process.
 pub fn parse<T: Parser>() -> T {
@@ -15,35 +15,13 @@ fn try_parse<T: Parser, W: Into<std::ffi::OsString> + Clone>(
     let mut command = with_negative_numbers(T::command());
     let matches = command.try_get_matches_from_mut(words);
     let matches = matches.map_err(|error| with_owner(&command, error))?;
-    check_instance(&command, &matches)?;
     T::from_arg_matches(&matches).map_err(|error| error.format(&mut command))
 }
 
-/// Id and name of the option that [`no_instance`] withdraws.
-const INSTANCE: &str = "instance";
-
-/// Replaces the common option `--instance` of a command that has nothing to do with any instance.
+/// Leaves the common option `--instance` out of the help of a command that has nothing to do with any instance. It
+/// is still accepted: scripts pass it to every command.
 pub fn no_instance() -> Arg {
-    Arg::new(INSTANCE).long(INSTANCE).value_name("NAME").hide(true)
-}
-
-/// Refuses `--instance`, also before the command, where the command has [`no_instance`].
-fn check_instance(command: &Command, matches: &ArgMatches) -> Result<(), Error> {
-    let (mut command, mut matches) = (command, matches);
-    while let Some((name, below)) = matches.subcommand() {
-        let Some(found) = command.find_subcommand(name) else { break };
-        (command, matches) = (found, below);
-    }
-    let is_withdrawn = command.get_arguments().any(|a| a.get_id() == INSTANCE && a.is_hide_set());
-    if !is_withdrawn || !matches.contains_id(INSTANCE) {
-        return Ok(());
-    }
-    let mut error = Error::new(ErrorKind::UnknownArgument).with_cmd(command);
-    let name = format!("--{INSTANCE}");
-    error.insert(ContextKind::InvalidArg, ContextValue::String(name));
-    let usage = command.clone().render_usage();
-    error.insert(ContextKind::Usage, ContextValue::StyledStr(usage));
-    Err(error)
+    Arg::new("instance").long("instance").value_name("NAME").hide(true)
 }
 
 /// Takes `-3` as the value of the preceding option, not as an option.
@@ -123,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn commands_that_concern_no_instance_neither_offer_nor_accept_one() {
+    fn commands_that_concern_no_instance_offer_none_but_accept_one() {
         let without = [
             ("evaluate", "evaluate a b"),
             ("cameras", "cameras"),
@@ -131,17 +109,14 @@ mod tests {
             ("map merge", "map merge a b --output c"),
         ];
         for (name, line) in without {
-            for line in
-                [format!("semidense {line} --instance x"), format!("semidense --instance x {line}")]
-            {
-                let error = refused(&line);
-                assert!(
-                    error.starts_with("error: unexpected argument '--instance' found"),
-                    "{error}"
-                );
-                assert!(error.contains(&format!("Usage: semidense {name} ")), "{error}");
+            for line in [
+                format!("semidense {line} --instance x"),
+                format!("semidense --instance x {line}"),
+                format!("semidense {line}"),
+            ] {
+                let parsed = try_parse::<CommandLine, _>(line.split(' ')).map(drop);
+                assert!(parsed.is_ok(), "{line}: {parsed:?}");
             }
-            assert!(try_parse::<CommandLine, _>(format!("semidense {line}").split(' ')).is_ok());
             let help = refused(&format!("semidense {name} --help"));
             assert!(help.contains("--config") && !help.contains("--instance"), "{help}");
         }

@@ -2,15 +2,16 @@
 . /host/guest/camera
 
 echo "-- listed"
+# -s: without it, jq -e succeeds on an empty file.
 as_user cameras > "$work/cameras.txt" 2>&1
 cat "$work/cameras.txt"
 as_user cameras --json > "$work/cameras.json"
 seen=$(jq -r '.[] | "\(.path) \(.card) (\(.driver)) \(.access), \(.formats | map(select(.usable).code) | join(" ")), \(.controls | length) controls"' "$work/cameras.json")
 expect "cameras: the capture node and not the output" "$seen" test "$(jq length "$work/cameras.json")" = 1
 expect "cameras: name of udev" "$(jq -r '.[0].names | join(" ")' "$work/cameras.json")" \
-    sh -c "jq -e '.[0].names | index(\"platform-vivid.0-video-index0\")' $work/cameras.json"
+    sh -c "jq -es '.[0][0].names | index(\"platform-vivid.0-video-index0\")' $work/cameras.json"
 expect "cameras: formats, sizes and controls" "$(grep -c 'format ' "$work/cameras.txt") formats" \
-    sh -c "jq -e '.[0] | ([.formats[].code] | contains([\"GREY\", \"YUYV\", \"NV12\", \"Y16\"])) and (.controls | any(.name == \"Gain\"))' $work/cameras.json"
+    sh -c "jq -es '.[0][0] | ([.formats[].code] | contains([\"GREY\", \"YUYV\", \"NV12\", \"Y16\"])) and (.controls | any(.name == \"Gain\"))' $work/cameras.json"
 
 echo "-- refused"
 seen=$(as_user run --source v4l:0 --output "$work/none" 2>&1)

@@ -24,11 +24,11 @@ kill "$feeder"
 cat "$work/watch.json"
 expect "run ends in order" "exit code $CODE" test "$CODE" = 130
 seen=$(jq -r '"\(.exact) of \(.exact + .unknown) frames, \(.repeated) of them repeated"' "$work/watch.json")
-expect "every frame is a picture of the recording, pixel for pixel" "$seen" sh -c "jq -e '.unknown == 0 and .exact > 100' $work/watch.json"
+expect "every frame is a picture of the recording, pixel for pixel" "$seen" sh -c "jq -es '.[0] | .unknown == 0 and .exact > 100' $work/watch.json"
 semidense evaluate "$work/run/trajectory.txt" "$work/truth.txt" --json > "$work/evaluation.json" 2>&1
 cat "$work/evaluation.json"
 seen=$(jq -r '"ATE \(.ate_rmse_m * 1000 | floor) mm, largest \(.ate_max_m * 1000 | floor) mm over \(.matched_poses) poses and \(.path_length_m) m"' "$work/evaluation.json")
-expect "the trajectory is the simulator's" "$seen" sh -c "jq -e '.matched_poses > 50 and .ate_rmse_m < 0.015 * .path_length_m' $work/evaluation.json"
+expect "the trajectory is the simulator's" "$seen" sh -c "jq -es '.[0] | .matched_poses > 50 and .ate_rmse_m < 0.015 * .path_length_m' $work/evaluation.json"
 mkdir -p /host/camera-run
 cp -r "$work/run" "$work/log" "$work"/*.json "$work/truth.txt" /host/camera-run/
 end_camera
