@@ -37,8 +37,8 @@ use waves::{CAMERA, header, image, keyframe};
 const WARM_UP: u64 = 150;
 /// Frames that are counted.
 const COUNTED: u64 = 300;
-/// Pause between two frames: the loop must wait for each.
-const PAUSE: Duration = Duration::from_millis(2);
+/// Period of the frames: the loop must wait for each, and may wake before it.
+const PERIOD: Duration = Duration::from_millis(4);
 /// Page faults allowed if the system refuses to lock memory.
 const UNLOCKED_PAGE_FAULTS: u64 = 20;
 /// Far above any expected duration: it ends a test that hangs.
@@ -78,9 +78,10 @@ impl Others {
         }
     }
 
-    /// Sends frames until `count` of them have a pose.
+    /// Sends frames at an even rate until `count` of them have a pose.
     fn send(&mut self, count: u64) {
         let (mut answered, start) = (0, Instant::now());
+        let mut due = start;
         while answered < count {
             assert!(start.elapsed() < WATCH_DOG, "no poses come");
             self._keyframe.0.serve_late_joiners();
@@ -97,7 +98,8 @@ impl Others {
             while self.health.receive().unwrap().is_some() {
                 self.reports += 1;
             }
-            std::thread::sleep(PAUSE);
+            due = (due + PERIOD).max(Instant::now());
+            std::thread::sleep(due.duration_since(Instant::now()));
         }
     }
 }
@@ -197,7 +199,7 @@ fn the_loop_allocates_no_more_than_its_transport() {
             root: place.root.display().to_string(),
             ..Config::default()
         };
-        // Frames are sent as fast as they are answered: half a period is no suitable deadline.
+        // Half a period of these frames is too short a deadline on a busy machine.
         config.tracker.deadline_ms = 1000.0;
         config.tracker.scheduling.lock_memory = true;
         config.tracker.early_wake_us = 300.0;
@@ -212,6 +214,7 @@ fn the_loop_allocates_no_more_than_its_transport() {
     assert!(of_loop.allocations <= of_transport.allocations, "{line}");
     let allowed = if active_scheduling().memory_locked { 0 } else { UNLOCKED_PAGE_FAULTS };
     assert!(of_loop.page_faults <= allowed, "{line}");
-    // One wait per frame, and some that a stale wake-up ended early.
+    // One wait per frame, a second one for each that is late after an early wake-up, and some that a stale wake-up
+    // ended early.
     assert!(of_loop.waits <= COUNTED + COUNTED / 5 + 20, "{line}");
 }

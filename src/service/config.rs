@@ -118,7 +118,7 @@ pub struct TrackerConfig {
     pub deadline_ms: f64,
     /// Live: the frame loop wakes this long before a frame is expected and polls for it until as long after,
     /// microseconds; 0 sleeps until it arrives. A sleeping CPU takes about 100 to wake; 300 costs 2 % of a CPU at 30
-    /// Hz. For cameras with an even period.
+    /// Hz. Only while frames arrive when expected.
     pub early_wake_us: f64,
     /// Live: frame periods without a frame after which tracker and mapper are stale.
     pub stale_periods: f64,

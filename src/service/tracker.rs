@@ -5,7 +5,7 @@ use std::time::Duration;
 use crate::service::budget::IterationCosts;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
-use crate::service::early_wake::Watch;
+use crate::service::early_wake::EarlyWake;
 use crate::service::frame_order::{FrameOrder, FrameOrderOutcome};
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
@@ -61,6 +61,7 @@ struct Shell<'a> {
     order: FrameOrder,
     /// CLOCK_MONOTONIC of the arrival of the last frame.
     last_arrival_nanos: Option<i64>,
+    early_wake: EarlyWake,
     /// Page faults of this thread until the loop was warm.
     warm_page_faults: Option<u64>,
     hub: Hub,
@@ -91,6 +92,7 @@ impl<'a> Shell<'a> {
             costs: IterationCosts::default(),
             order: FrameOrder::default(),
             last_arrival_nanos: None,
+            early_wake: EarlyWake::new(config.tracker.early_wake_us),
             warm_page_faults: None,
             hub,
             _claim: claim,
@@ -120,16 +122,13 @@ impl<'a> Shell<'a> {
         Ok(())
     }
 
-    /// Sleeps until something happens; returns a frame that has arrived. Live, if it is configured to, it wakes shortly
-    /// before the next frame and polls for it.
+    /// Sleeps until something happens; returns a frame that has arrived. Live, if it is configured to and frames are
+    /// punctual, it wakes shortly before the next frame and polls for it.
     fn await_frame(
         &mut self,
         shutdown: &Shutdown,
     ) -> Result<Option<Received<u8, FrameHeader>>, RunError> {
-        let early_us = self.config.tracker.early_wake_us;
-        let (last, period) = (self.last_arrival_nanos, self.order.period_nanos());
-        let watch = Watch::plan(early_us, last, period, now_nanos());
-        let watch = watch.filter(|_| self.mode == Mode::Live);
+        let watch = self.early_wake.watch(now_nanos()).filter(|_| self.mode == Mode::Live);
         let sleep = watch.map_or(WAKE_PERIOD, |watch| watch.sleep(now_nanos()).min(WAKE_PERIOD));
         wait(&[self.frames.events()], Some(shutdown.descriptor()), sleep)?;
         while watch.is_some_and(|watch| watch.is_on(now_nanos())) {
@@ -167,6 +166,7 @@ impl<'a> Shell<'a> {
             return Ok(());
         }
         self.last_arrival_nanos = Some(arrival_nanos);
+        self.early_wake.arrive(arrival_nanos, self.order.period_nanos());
         let deadline_nanos = self.deadline_nanos(arrival_nanos);
         let (estimate, track_nanos) = self.track(&frame, intrinsics, deadline_nanos)?;
         let wake_nanos = arrival_nanos.saturating_sub(header.sent_nanos);
