@@ -158,7 +158,8 @@ fn supervise(
         counters,
     });
     let loaded_map = loaded_map(place);
-    let first_keyframe_id = options.journal.as_ref().map_or(0, |kept| kept.start.first_keyframe_id);
+    let of_start = options.journal.as_ref().map_or(0, |kept| kept.start.first_keyframe_id);
+    let first_keyframe_id = loaded_map.as_ref().map_or(of_start, |map| map.first_keyframe_id);
     let record =
         RunRecord { ended, refused, restart_causes, loaded_map, first_keyframe_id, ..record };
     Ok(RunOutcome { record, journal, source })

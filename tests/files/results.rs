@@ -55,7 +55,13 @@ fn a_map_loaded_on_request_is_not_graded_as_a_broken_one() {
     let record = record(poses, (0..3).map(in_epoch).collect(), false);
     for (first_epoch, parts) in [(None, Some(3)), (Some(1), Some(2)), (Some(2), None)] {
         let (folder, read_only) = (String::new(), false);
-        let loaded_map = first_epoch.map(|of| LoadedMap { folder, read_only, first_epoch: of });
+        let first_keyframe_id = 0;
+        let loaded_map = first_epoch.map(|first_epoch| LoadedMap {
+            folder,
+            read_only,
+            first_epoch,
+            first_keyframe_id,
+        });
         let folder = tempfile::tempdir().unwrap();
         let loaded = RunRecord { loaded_map, ..record.clone() };
         let (summary, _) = written(&folder.path().join("out"), &loaded);

@@ -108,7 +108,8 @@ impl Shell<'_> {
         let map = MapConfig { folder: name.to_owned(), read_only, ..self.config.map.clone() };
         let (session, mut next) = self.start_in_map(&map, &camera, numbering)?;
         self.save_map_folder()?;
-        self.used = UsedMap { switched_to: Some(map), numbering, ..self.used.clone() };
+        let (switched_to, first_keyframe_id) = (Some(map), next.free_keyframe_id());
+        self.used = UsedMap { switched_to, numbering, first_keyframe_id, ..self.used.clone() };
         self.note_loaded_map()?;
         if let Some((_, before)) = self.mapper.take() {
             next.replace_mapper(before);

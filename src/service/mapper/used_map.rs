@@ -29,13 +29,17 @@ pub(super) struct UsedMap {
     pub(super) switched_to: Option<MapConfig>,
     /// The map's numbers in this run.
     pub(super) numbering: Numbering,
+    /// First id of a keyframe made in the map that it has switched to.
+    #[serde(default)]
+    pub(super) first_keyframe_id: u64,
 }
 
 /// The map that the mapper of a run has switched to; `None` where it stayed in its own.
 pub(crate) fn loaded_map(place: &Place) -> Option<LoadedMap> {
     let used = UsedMap::read(&place.loaded_map_path()).ok()??;
     let MapConfig { folder, read_only, .. } = used.switched_to?;
-    Some(LoadedMap { folder, read_only, first_epoch: used.numbering.epochs })
+    let (first_epoch, first_keyframe_id) = (used.numbering.epochs, used.first_keyframe_id);
+    Some(LoadedMap { folder, read_only, first_epoch, first_keyframe_id })
 }
 
 /// Opens the checkpoint of a live mapper, and reads what a dead one left: a map that it made in another folder than the
@@ -137,7 +141,8 @@ mod tests {
     fn left(place: &Place) -> UsedMap {
         let numbering = Numbering { ids: 3, epochs: 2, revisions: 1 };
         let switched_to = Some(config("/b"));
-        let used = UsedMap { switched_to, numbering, ..UsedMap::of(&config("/a")) };
+        let used =
+            UsedMap { switched_to, numbering, first_keyframe_id: 6, ..UsedMap::of(&config("/a")) };
         used.write(&place.loaded_map_path()).unwrap();
         let point = DepthPoint { u: 9, v: 9, inverse_depth: 1.0, variance: 0.1, intensity: 9.0 };
         let camera = Intrinsics::pinhole(17, 16, 20.0);
@@ -156,7 +161,8 @@ mod tests {
         UsedMap::of(&config("/a")).write(&place.loaded_map_path()).unwrap();
         assert_eq!(loaded_map(&place), None);
         left(&place);
-        let loaded = LoadedMap { folder: "/b".to_owned(), read_only: false, first_epoch: 2 };
+        let folder = "/b".to_owned();
+        let loaded = LoadedMap { folder, read_only: false, first_epoch: 2, first_keyframe_id: 6 };
         assert_eq!(loaded_map(&place), Some(loaded));
     }
 

@@ -101,6 +101,8 @@ pub struct LoadedMap {
     pub read_only: bool,
     /// The run's first epoch in it: those below belong to the map before.
     pub first_epoch: u32,
+    /// First id of a keyframe made in it by the run.
+    pub first_keyframe_id: u64,
 }
 
 /// Everything that is recorded of a run.
