@@ -10,6 +10,7 @@ use iceoryx2::node::NodeState;
 use iceoryx2::prelude::*;
 use rustix::fs::FlockOperation;
 
+use crate::wire::folders::SHARED_MEMORY;
 use crate::wire::lock_file::{is_held, lock_named};
 use crate::wire::place::{
     CHECKPOINT_SUFFIX, CLAIM_SUFFIX, JOIN_LOCK, LOADED_MAP_SUFFIX, MEMBERS, POSITION_SUFFIX, Place,
@@ -23,9 +24,9 @@ const LONGEST_TIDY_WAIT: Duration = Duration::from_secs(1);
 const SUCCESSOR_WAIT: Duration = Duration::from_secs(30);
 
 impl Place {
-    /// Removes what iceoryx2 deliberately leaves behind after its last node: its counter of nodes and its empty
-    /// folders; and what killed processes left, unless a successor may still need it. While a process is present only
-    /// the remains of dead ones are removed, and while one joins nothing.
+    /// Removes what iceoryx2 leaves behind after its last node: its counter of nodes, its empty folders, and what a
+    /// process had when it was killed while it joined; and what killed processes left, unless a successor may still
+    /// need it. While a process is present only the remains of dead ones are removed, and while one joins nothing.
     pub fn tidy(&self) {
         let path = self.root.join(JOIN_LOCK);
         // Waits for a process that joins or tidies up: of two that leave together, the second must also check for what
@@ -37,11 +38,13 @@ impl Place {
         self.remove_dead_nodes();
         self.remove_failed_nodes();
         self.remove_left_files();
-        if !self.has_nodes() {
-            self.node_counters().for_each(|path| drop(fs::remove_file(path)));
+        if self.is_deserted() {
+            // Without a node no process has any of it open; what iceoryx2 did not remove belongs to processes that were
+            // killed while they joined.
+            self.transport_files(Path::new(SHARED_MEMORY), "")
+                .for_each(|path| drop(fs::remove_file(path)));
             self.remove_abandoned();
-            let _ = fs::remove_dir(self.root.join("nodes"));
-            // Without a node no process has a service open: those left belong to dead processes.
+            let _ = fs::remove_dir_all(self.root.join("nodes"));
             let _ = fs::remove_dir_all(self.root.join("services"));
             // The sockets of events.
             self.transport_files(&self.root, ".event").for_each(|path| drop(fs::remove_file(path)));
@@ -52,6 +55,28 @@ impl Place {
     /// Whether there are nodes, living or dead, below the root.
     fn has_nodes(&self) -> bool {
         fs::read_dir(self.root.join("nodes")).is_ok_and(|mut nodes| nodes.next().is_some())
+    }
+
+    /// Whether no node lives: there is none, or each is known to be dead. Only while no process can join.
+    fn is_deserted(&self) -> bool {
+        let monitors = self.node_monitors().count();
+        if monitors == 0 {
+            return true;
+        }
+        let Ok(config) = self.transport_config() else { return false };
+        let mut dead = 0;
+        let listed = Node::<ipc::Service>::list(&config, |state| {
+            dead += usize::from(matches!(state, NodeState::Dead(_)));
+            CallbackProgression::Continue
+        });
+        listed.is_ok() && dead == monitors
+    }
+
+    /// Names of the files by which nodes are known to live.
+    fn node_monitors(&self) -> impl Iterator<Item = String> {
+        let nodes = fs::read_dir(self.root.join("nodes")).into_iter().flatten().flatten();
+        let names = nodes.map(|entry| entry.file_name().to_string_lossy().into_owned());
+        names.filter(|name| name.ends_with(".node_monitor"))
     }
 
     /// Removes what killed processes left in shared memory. The last process to leave may be the only one to do so.
@@ -75,13 +100,7 @@ impl Place {
         let nodes = self.root.join("nodes");
         for entry in fs::read_dir(&nodes).into_iter().flatten().flatten() {
             let id = entry.file_name().to_string_lossy().into_owned();
-            let has_monitor = || {
-                let mut others = fs::read_dir(&nodes).into_iter().flatten().flatten();
-                others.any(|other| {
-                    let name = other.file_name().to_string_lossy().into_owned();
-                    name.contains(&id) && name.contains(".node_monitor")
-                })
-            };
+            let has_monitor = || self.node_monitors().any(|name| name.contains(&id));
             if entry.file_type().is_ok_and(|kind| kind.is_dir()) && !has_monitor() {
                 let _ = fs::remove_dir_all(entry.path());
             }

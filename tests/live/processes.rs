@@ -284,6 +284,22 @@ fn a_killed_tracker_is_restarted() {
 }
 
 #[test]
+fn nothing_is_left_of_a_process_that_was_killed_while_it_joined() {
+    let rig = Rig::new();
+    let nodes = rig.root().join("nodes");
+    // Joining takes some tens of milliseconds.
+    for delay_ms in (0..60).step_by(3) {
+        let tracker = rig.command(&["tracker"]).spawn().unwrap();
+        until("a node", || nodes.read_dir().ok()?.next().map(drop));
+        std::thread::sleep(Duration::from_millis(delay_ms));
+        signal(&tracker, Signal::KILL);
+        end(tracker);
+        rig.place().tidy();
+        assert_eq!(rig.leftovers(), Vec::<String>::new(), "killed after {delay_ms} ms");
+    }
+}
+
+#[test]
 fn nothing_outlives_a_killed_supervisor() {
     let rig = Rig::new();
     let child = rig.run(SLOW_FRAMES, SLOW).spawn().unwrap();
