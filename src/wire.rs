@@ -18,4 +18,5 @@ mod root_folder;
 pub(crate) mod shared_memory;
 mod tidy;
 pub mod topic;
+mod unfinished;
 mod version;

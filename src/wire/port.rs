@@ -103,6 +103,7 @@ impl Hub {
         set_log_level(LogLevel::Fatal);
         place.check_shared_memory(JOIN_BYTES)?;
         let _joining = place.block_tidy()?;
+        place.remove_unfinished();
         let root = place.root.display().to_string();
         let failed =
             |reason: String| OpenError::Node { root: root.clone(), reason: explain(&reason) };
@@ -122,8 +123,9 @@ impl Hub {
         Ok(Self { node, place: place.clone(), access })
     }
 
-    /// Removes what dead processes left behind; takes milliseconds, so not for a frame loop.
+    /// Removes what dead processes left behind; takes milliseconds and more, so not for a frame loop.
     pub fn clean_up(&self) {
+        self.place.remove_unfinished();
         self.node.try_cleanup_dead_nodes();
     }
 

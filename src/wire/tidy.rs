@@ -34,6 +34,7 @@ impl Place {
         let end = Instant::now() + LONGEST_TIDY_WAIT;
         let alone = FlockOperation::NonBlockingLockExclusive;
         let Ok(Some(_lock)) = lock_named(&path, alone, end) else { return };
+        self.remove_unfinished();
         // What cannot be removed is left to the next process.
         self.remove_dead_nodes();
         self.remove_failed_nodes();
@@ -187,7 +188,7 @@ fn is_checkpoint(name: &str) -> bool {
 enum Kind {
     /// A checkpoint, a position, or the name of the map that was switched to.
     Kept,
-    /// A checkpoint that was being written.
+    /// One of these that was being written.
     Unfinished,
     /// The claim of a process.
     Claim,
@@ -196,7 +197,8 @@ enum Kind {
 impl Kind {
     /// Returns the kind by the file's name; `None` for files that are not ours.
     fn of(name: &str) -> Option<Self> {
-        if name.contains(CHECKPOINT_SUFFIX) && name.ends_with(".tmp") {
+        let kept = [CHECKPOINT_SUFFIX, POSITION_SUFFIX, LOADED_MAP_SUFFIX];
+        if name.ends_with(".tmp") && kept.iter().any(|suffix| name.contains(suffix)) {
             return Some(Self::Unfinished);
         }
         if is_checkpoint(name)
@@ -292,14 +294,15 @@ mod tests {
         for path in kept.iter().chain([&other]) {
             fs::write(path, "x").unwrap();
         }
-        let unfinished = folder.path().join(".rig.checkpoint.17.tmp");
-        fs::write(&unfinished, "x").unwrap();
+        let unfinished = [".rig.checkpoint.17.tmp", ".rig.map.17.tmp", ".rig.position.17.tmp"];
+        let unfinished = unfinished.map(|name| folder.path().join(name));
+        unfinished.iter().for_each(|path| fs::write(path, "x").unwrap());
         let claims = ["capture", "tracker", "mapper", "supervisor"].map(|p| killed(&place, p));
         // As `status` does on leaving while all of them await their restart.
         place.tidy();
         assert!(kept.iter().chain(&claims).all(|path| path.exists()));
         assert!(!other.exists(), "it has no process that was killed");
-        assert!(!unfinished.exists());
+        assert!(unfinished.iter().all(|path| !path.exists()));
         // The newer of the two counts: a map that does not change is seldom written.
         age(&kept[0]);
         place.tidy();
