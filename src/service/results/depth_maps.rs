@@ -13,7 +13,7 @@ pub fn evaluate_depth(
     source: &mut dyn FrameSource,
 ) -> Result<DepthErrors, SourceError> {
     let mut errors = DepthErrors::default();
-    let of_epoch = record.own_keyframes().iter().filter(|k| Some(k.epoch) == epoch);
+    let of_epoch = record.own_keyframes().filter(|k| Some(k.epoch) == epoch);
     for keyframe in of_epoch.filter(|k| is_evaluated(k)) {
         let true_depth = match source.depth_at(keyframe.capture_nanos) {
             // One damaged file must not cost the results.

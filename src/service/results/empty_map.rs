@@ -9,8 +9,11 @@ pub fn empty_map_warning(
     map_points: usize,
     resolution: MapResolution,
 ) -> Option<String> {
-    let is_thinned_away = points > 0 && map_points == 0 && resolution != MapResolution::default();
-    is_thinned_away.then(|| {
+    let is_coarse = match (resolution, MapResolution::default()) {
+        (MapResolution::Relative(share), MapResolution::Relative(usual)) => share > usual,
+        (resolution, usual) => resolution != usual,
+    };
+    (points > 0 && map_points == 0 && is_coarse).then(|| {
         format!(
             "map.ply is empty: the map resolution {resolution} is too coarse for this scene; give a smaller one \
              (--map-resolution, results.map_resolution), such as {}",
@@ -31,5 +34,7 @@ mod tests {
         assert_eq!(empty_map_warning(900, 1, coarse), None);
         assert_eq!(empty_map_warning(0, 0, coarse), None);
         assert_eq!(empty_map_warning(900, 0, MapResolution::default()), None);
+        assert!(empty_map_warning(900, 0, MapResolution::Relative(0.1)).is_some());
+        assert_eq!(empty_map_warning(900, 0, MapResolution::Relative(0.001)), None);
     }
 }

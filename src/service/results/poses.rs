@@ -130,7 +130,7 @@ pub fn normalized_errors_of(
     let in_epoch = |of: u32| epoch.is_none_or(|epoch| of == epoch);
     let tracked: Vec<&PoseEstimate> =
         tracked(record).filter(|estimate| in_epoch(final_epoch(record, estimate))).collect();
-    let keyframes = record.own_keyframes().iter().filter(|keyframe| in_epoch(keyframe.epoch));
+    let keyframes = record.own_keyframes().filter(|keyframe| in_epoch(keyframe.epoch));
     let stamps: Vec<(u64, i64)> = keyframes.map(|k| (k.keyframe_id, k.capture_nanos)).collect();
     let truth = &record.ground_truth;
     // Before its epoch was joined to this one, a frame was placed in another map.

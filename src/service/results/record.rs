@@ -186,9 +186,8 @@ impl RunRecord {
         Self { mode, source: source.to_owned(), ..Self::default() }
     }
 
-    /// The keyframes made in this run; what it is compared with knows nothing of earlier runs. Ids ascend.
-    pub fn own_keyframes(&self) -> &[Keyframe] {
-        let (all, first) = (&self.map.keyframes, self.first_keyframe_id);
-        &all[all.partition_point(|keyframe| keyframe.keyframe_id < first)..]
+    /// The keyframes made in this run; what it is compared with knows nothing of earlier runs.
+    pub fn own_keyframes(&self) -> impl Iterator<Item = &Keyframe> {
+        self.map.keyframes.iter().filter(|keyframe| keyframe.keyframe_id >= self.first_keyframe_id)
     }
 }

@@ -379,7 +379,7 @@ impl Summary {
             frames_skipped_by_mapper: record.frames_skipped_by_mapper,
             times: StepTimes::of(record),
             joint: JointSummary::of(&record.adjustments),
-            loops: LoopSummary::of(record.searches.as_deref(), record.own_keyframes().len()),
+            loops: LoopSummary::of(record.searches.as_deref(), record.own_keyframes().count()),
             budget_curve: BudgetCurve::of(&record.budget_samples),
             recorded_secs,
             wall_secs,
@@ -421,7 +421,6 @@ pub fn without_depth(map: &Map) -> u64 {
 
 /// The grade of a run.
 fn grade(record: &RunRecord) -> Grade {
-    let keyframes = record.own_keyframes();
     let sequences = record.poses.iter().map(|pose| pose.estimate.sequence);
     let (first, last) = (sequences.clone().min(), sequences.max());
     let frames = last.zip(first).map_or(0, |(last, first)| last - first + 1);
@@ -437,7 +436,7 @@ fn grade(record: &RunRecord) -> Grade {
         rejections: record.rejections.as_ref().map_or(0, |all| all.len() as u64),
         frames,
         width: record.map.keyframes.first().map_or(0, |keyframe| keyframe.intrinsics.width),
-        consistency: MapConsistency::measure(keyframes),
+        consistency: MapConsistency::measure(&record.map.keyframes),
     })
 }
 
