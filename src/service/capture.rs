@@ -134,8 +134,11 @@ impl<'a> Shell<'a> {
         let hub = Hub::join(&place, "capture", Access::Member)?;
         let (source_name, path) = (options.source.to_string(), place.position_path());
         let (position, left) = PositionRecorder::of_run(&path, options.mode, &source_name, rig);
-        // A supervisor keeps track of earlier captures; without one the tracker is queried too.
-        let asks_tracker = options.mode == Mode::Live && left.is_none() && !is_supervised();
+        // A supervisor keeps track of earlier captures; without one the tracker is queried too. It does not know of
+        // which recording its last frame was.
+        let is_camera = options.source.is_camera();
+        let asks_tracker =
+            is_camera && options.mode == Mode::Live && left.is_none() && !is_supervised();
         let mut health = Health::open(&hub, &CAPTURE_HEALTH)?;
         health.set_source(&options.source.to_string());
         health.counters().total = source.num_frames().unwrap_or(0) as u64;
@@ -332,8 +335,8 @@ impl<'a> Shell<'a> {
             // A driver's stamp may lie in the future; no latency is negative.
             Mode::Live if !self.is_recorded() => stamp.capture_nanos.min(now_nanos()),
             Mode::Live => {
-                let start = Pace::start(stamp.capture_nanos, now_nanos());
-                let due = self.pace.get_or_insert(start).due_nanos(stamp.capture_nanos);
+                let (stamp, now) = (stamp.capture_nanos, now_nanos());
+                let due = self.pace.get_or_insert(Pace::start(stamp, now)).due_nanos(stamp, now);
                 wait_until(due, self.shutdown, &mut self.health)?;
                 due
             }

@@ -54,21 +54,35 @@ pub fn wait_at_most(longest: Duration, mut is_over: impl FnMut() -> bool) -> boo
     true
 }
 
-/// When recorded frames are due: as long after the first as their stamps are.
+/// Longest time between two stamps that is waited for: a longer one is a jump of the clock that stamped them, or a
+/// recording that was paused.
+const LONGEST_STEP_NANOS: i64 = 5_000_000_000;
+
+/// When recorded frames are due: as long after the first as their stamps are, except that jumps are skipped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pace {
     first_stamp_nanos: i64,
     first_clock_nanos: i64,
+    last_stamp_nanos: i64,
 }
 
 impl Pace {
     /// The first frame, with this stamp, is due at `clock_nanos`.
     pub fn start(stamp_nanos: i64, clock_nanos: i64) -> Self {
-        Self { first_stamp_nanos: stamp_nanos, first_clock_nanos: clock_nanos }
+        Self {
+            first_stamp_nanos: stamp_nanos,
+            first_clock_nanos: clock_nanos,
+            last_stamp_nanos: stamp_nanos,
+        }
     }
 
-    /// When the frame with this stamp is due.
-    pub fn due_nanos(&self, stamp_nanos: i64) -> i64 {
+    /// When the next frame is due, which has this stamp; at once, at `clock_nanos`, after a jump forward or back.
+    pub fn due_nanos(&mut self, stamp_nanos: i64, clock_nanos: i64) -> i64 {
+        let step = stamp_nanos.saturating_sub(self.last_stamp_nanos);
+        if !(0..=LONGEST_STEP_NANOS).contains(&step) {
+            *self = Self::start(stamp_nanos, clock_nanos);
+        }
+        self.last_stamp_nanos = stamp_nanos;
         let since_first = stamp_nanos.saturating_sub(self.first_stamp_nanos);
         self.first_clock_nanos.saturating_add(since_first)
     }
@@ -80,10 +94,22 @@ mod tests {
 
     #[test]
     fn frames_are_due_according_to_their_stamps() {
-        let pace = Pace::start(5_000, 1_000_000);
-        assert_eq!(pace.due_nanos(5_000), 1_000_000);
-        assert_eq!(pace.due_nanos(38_000), 1_033_000);
-        assert_eq!(pace.due_nanos(i64::MAX), i64::MAX, "a hostile stamp does not overflow");
+        let mut pace = Pace::start(5_000, 1_000_000);
+        assert_eq!(pace.due_nanos(5_000, 1_000_010), 1_000_000);
+        assert_eq!(pace.due_nanos(38_000, 1_000_020), 1_033_000);
+        let late = 38_000 + LONGEST_STEP_NANOS;
+        assert_eq!(pace.due_nanos(late, 1_034_000), 1_033_000 + LONGEST_STEP_NANOS);
+    }
+
+    #[test]
+    fn jumps_of_the_stamps_are_not_waited_for() {
+        let mut pace = Pace::start(5_000, 1_000_000);
+        for stamp in [5_001 + LONGEST_STEP_NANOS, -40, i64::MAX, i64::MIN, i64::MAX] {
+            assert_eq!(pace.due_nanos(stamp, 2_000_000), 2_000_000, "{stamp}");
+        }
+        let mut pace = Pace::start(i64::MAX - 10, 0);
+        pace.due_nanos(7, 3_000_000);
+        assert_eq!(pace.due_nanos(40, 3_000_001), 3_000_033, "it goes on from there");
     }
 
     #[test]
