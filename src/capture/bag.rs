@@ -27,6 +27,7 @@ use crate::capture::rectifier::Rectifier;
 use crate::capture::rig::Rig;
 use crate::capture::source::{FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
+use crate::capture::v4l::stamps::MAX_REFUSED_IN_A_ROW;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// A topic's images as a frame source.
@@ -36,6 +37,8 @@ pub struct Bag {
     contents: Contents,
     records: Records,
     rectifier: Rectifier,
+    /// Whether images without our own recording's record have the stamps of their headers, not the log times.
+    has_header_stamps: bool,
     /// Our own recording's record of the next image.
     record: Option<FrameRecord>,
     /// The source's number of the first frame.
@@ -44,6 +47,8 @@ pub struct Bag {
     next: u64,
     /// Stamp of the previous frame.
     last_nanos: Option<i64>,
+    /// Images refused for their stamps since then.
+    refused_in_a_row: u32,
     notice: Option<Notice>,
 }
 
@@ -66,12 +71,14 @@ pub fn open(path: &Path, topic: Option<&str>, rig: Option<&Path>) -> Result<Bag,
     Ok(Bag {
         path: path.to_owned(),
         records: Records::open(path).map_err(bag)?,
+        has_header_stamps: contents.has_header_stamps(path).map_err(bag)?,
         contents,
         rectifier,
         record: None,
         first_sequence: None,
         next: 0,
         last_nanos: None,
+        refused_in_a_row: 0,
         notice,
     })
 }
@@ -102,7 +109,7 @@ impl Bag {
     }
 
     /// Returns the stamp of an image whose header has `stamp`: that of our own recording, if it has one, else that of
-    /// the header, or the time of recording if the header's was never set.
+    /// the header, or the time of recording if the bag's headers have none.
     fn stamp(
         &mut self,
         stamp: Result<i64, message::CdrError>,
@@ -126,17 +133,25 @@ impl Bag {
             }
             None => FrameStamp {
                 sequence,
-                capture_nanos: if stamp == 0 { log_nanos } else { stamp },
+                capture_nanos: if self.has_header_stamps { stamp } else { log_nanos },
                 ..FrameStamp::default()
             },
         };
-        let nanos = frame.capture_nanos;
-        if self.last_nanos.is_some_and(|last| nanos <= last) {
-            return Err(BagImageError::Disordered { nanos });
-        }
-        self.last_nanos = Some(nanos);
+        self.check_order(frame.capture_nanos)?;
         self.next = frame.sequence.saturating_add(1);
         Ok(frame)
+    }
+
+    /// Refuses a stamp that is not later than the previous one, until so many in a row show that the clock has stepped.
+    fn check_order(&mut self, nanos: i64) -> Result<(), BagImageError> {
+        let is_old = self.last_nanos.is_some_and(|last| nanos <= last);
+        if is_old && self.refused_in_a_row < MAX_REFUSED_IN_A_ROW {
+            self.refused_in_a_row += 1;
+            return Err(BagImageError::Disordered { nanos });
+        }
+        self.refused_in_a_row = 0;
+        self.last_nanos = Some(nanos);
+        Ok(())
     }
 
     fn lost(&self, problem: BagImageError) -> SourceError {

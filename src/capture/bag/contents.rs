@@ -5,7 +5,7 @@ use std::path::Path;
 
 use crate::capture::bag::bag_error::BagError;
 use crate::capture::bag::camera::rig_of;
-use crate::capture::bag::message::{CameraInfo, decode};
+use crate::capture::bag::message::{CameraInfo, Stamped, decode};
 use crate::capture::bag::records::{Place, Records};
 use crate::capture::bag::topics::{
     Channel, Channels, Kind, camera_topic, frame_record_topic, listed,
@@ -76,14 +76,7 @@ impl Contents {
             return Err(missing());
         }
         let mut records = Records::open(path)?;
-        loop {
-            let place = match records.advance() {
-                // Damage is reported when playing reaches it.
-                Err(BagError::Damaged { .. }) => continue,
-                other => other?,
-            };
-            let Some(place) = place else { return Err(missing()) };
-            let Place::Message { channel, .. } = place else { continue };
+        while let Some(channel) = next_message(&mut records)? {
             if self.channels.get(&channel) != Some(&Kind::CameraInfo) {
                 continue;
             }
@@ -92,10 +85,43 @@ impl Contents {
                 decode(records.message()).map_err(|error| wrong(error.to_string()))?;
             return rig_of(&camera, &self.topic, path).map_err(wrong);
         }
+        Err(missing())
+    }
+
+    /// Whether the headers of the images have stamps. They have none if those of the first two images are both 0; one
+    /// alone may be the start of a simulation's clock.
+    pub fn has_header_stamps(&self, path: &Path) -> Result<bool, BagError> {
+        let mut records = Records::open(path)?;
+        let mut num_unset = 0;
+        while num_unset < 2 {
+            let Some(channel) = next_message(&mut records)? else { break };
+            if self.image_kind(channel).is_none() {
+                continue;
+            }
+            match decode(records.message()).map(|header: Stamped| header.stamp_nanos()) {
+                Ok(0) => num_unset += 1,
+                Ok(_) => return Ok(true),
+                // Reported when playing reaches it.
+                Err(_) => {}
+            }
+        }
+        Ok(false)
     }
 }
 
-/// Returns the channels in the summary; `None` if it lacks them or their counts.
+/// Advances to the next message and returns its channel; `None` at the end. Damage is reported when playing reaches it.
+fn next_message(records: &mut Records) -> Result<Option<u16>, BagError> {
+    loop {
+        match records.advance() {
+            Ok(Some(Place::Message { channel, .. })) => return Ok(Some(channel)),
+            Ok(None) => return Ok(None),
+            Ok(Some(_)) | Err(BagError::Damaged { .. }) => {}
+            Err(error) => return Err(error),
+        }
+    }
+}
+
+/// Returns the channels in the summary; `None` if it lacks them, their counts or their types.
 fn read_channels(records: &mut Records) -> Result<Option<Channels>, BagError> {
     let (mut channels, mut counts) = (Channels::new(), None);
     loop {
@@ -115,7 +141,8 @@ fn read_channels(records: &mut Records) -> Result<Option<Channels>, BagError> {
             channel.num_messages = count;
         }
     }
-    Ok((!channels.is_empty()).then_some(channels))
+    let is_complete = !channels.is_empty() && !records.lacks_types;
+    Ok(is_complete.then_some(channels))
 }
 
 /// Whether a file of this length can hold the messages that its summary counts: each takes at least one byte.

@@ -53,6 +53,8 @@ pub struct Records {
     in_chunk: Option<Range<usize>>,
     /// Kind of the messages of a type, by the type's number.
     kinds: HashMap<u16, Option<Kind>>,
+    /// Whether a channel named a type that did not come before it.
+    pub lacks_types: bool,
     /// Channel of the current message.
     pub channel: u16,
     /// Whether the end was reached, early or not.
@@ -82,6 +84,7 @@ impl Records {
             chunk_position: 0,
             in_chunk: None,
             kinds: HashMap::new(),
+            lacks_types: false,
             channel: 0,
             has_ended: false,
             is_unfinished: false,
@@ -244,8 +247,10 @@ impl Records {
                 return Ok(None);
             }
             Record::Channel(found) => {
-                let kind = self.kinds.get(&found.schema_id).copied().flatten();
-                let kind = kind.filter(|_| found.message_encoding == "cdr");
+                let kind = self.kinds.get(&found.schema_id).copied();
+                // 0 stands for no type.
+                self.lacks_types |= kind.is_none() && found.schema_id != 0;
+                let kind = kind.flatten().filter(|_| found.message_encoding == "cdr");
                 Place::Channel(found.id, Channel { topic: found.topic, kind, num_messages: 0 })
             }
             Record::Message { header, .. } => Place::Message {

@@ -62,6 +62,50 @@ fn opened(bytes: &[u8], topic: Option<&str>) -> (Written, Result<Bag, SourceErro
     (file, bag)
 }
 
+/// Numbers and stamps of the frames of a bag whose images have these header and log times, and how many are refused.
+fn stamps_of(times: &[(i64, i64)]) -> (Vec<(u64, i64)>, usize) {
+    let mut bag = camera_bag(0);
+    bag.message(2, 1, &camera_info(WIDTH, HEIGHT, "plumb_bob", &[], K, 0));
+    for (header, log) in times {
+        bag.message(1, *log, &image(*header, WIDTH, HEIGHT, "mono8", WIDTH, &[1; PIXELS]));
+    }
+    let (_file, bag) = opened(&bag.finish(), None);
+    let (mut bag, mut pixels) = (bag.unwrap(), vec![0; PIXELS]);
+    let (mut frames, mut refused) = (Vec::new(), 0);
+    loop {
+        match bag.next_into(&mut pixels) {
+            Ok(Some(stamp)) => frames.push((stamp.sequence, stamp.capture_nanos)),
+            Ok(None) => return (frames, refused),
+            Err(error) => {
+                assert!(error.to_string().contains("is not later"), "{error}");
+                refused += 1;
+            }
+        }
+    }
+}
+
+/// The file of `bag` with a summary that does not repeat the schemas: records of an unknown kind are in their place.
+fn without_repeated_schemas(bag: TestBag) -> Vec<u8> {
+    const SCHEMA: u8 = 3;
+    const UNKNOWN: u8 = 0x80;
+    const PREFIX_BYTES: usize = 9;
+    /// The footer's content, which begins with the place of the summary, and the magic.
+    const END_BYTES: usize = 20 + 8;
+    let mut bytes = bag.finish();
+    let number = |bytes: &[u8], at: usize| {
+        u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as usize
+    };
+    let end = bytes.len() - END_BYTES;
+    let mut at = number(&bytes, end);
+    while at < end {
+        if bytes[at] == SCHEMA {
+            bytes[at] = UNKNOWN;
+        }
+        at += PREFIX_BYTES + number(&bytes, at + 1);
+    }
+    bytes
+}
+
 fn error_of(bytes: &[u8], topic: Option<&str>) -> String {
     let message = opened(bytes, topic).1.expect_err("an error").to_string();
     assert!(message.contains("a.mcap") && !message.contains('\n'), "{message}");
@@ -187,6 +231,41 @@ fn images_that_cannot_be_used_are_one_error_each() {
         assert!(error.contains(expected) && error.contains("/cam/image_raw"), "{error}");
     }
     assert_eq!(errors.len(), expected.len());
+}
+
+#[test]
+fn a_bag_has_one_clock() {
+    let log = |number: i64| 1_700_000_000_000_000_000 + number * 33;
+    // A simulation starts at 0; a later 0 is a disordered stamp.
+    let times = [(0, log(0)), (33, log(1)), (0, log(2)), (99, log(3))];
+    assert_eq!(stamps_of(&times), (vec![(0, 0), (1, 33), (3, 99)], 1));
+    assert_eq!(stamps_of(&[(33, log(0)), (0, log(1))]), (vec![(0, 33)], 1));
+    // Headers without stamps: the log times count to the end.
+    let times = [(0, log(0)), (0, log(1)), (66, log(2))];
+    assert_eq!(stamps_of(&times), (vec![(0, log(0)), (1, log(1)), (2, log(2))], 0));
+    assert_eq!(stamps_of(&times[..1]), (vec![(0, log(0))], 0));
+}
+
+#[test]
+fn a_step_of_the_clock_does_not_end_a_bag() {
+    const SECOND: i64 = 1_000_000_000;
+    // A clock that steps back, and one stamp far in the future.
+    for before in [[1000_i64, 1001], [1, 2_000_000_000]] {
+        let secs = before.into_iter().chain(11..=25);
+        let times: Vec<(i64, i64)> = secs.map(|secs| (secs * SECOND, 5)).collect();
+        let mut expected = vec![(0, before[0] * SECOND), (1, before[1] * SECOND)];
+        let resumed = 2 + MAX_REFUSED_IN_A_ROW as usize;
+        expected.extend((resumed..times.len()).map(|i| (i as u64, times[i].0)));
+        assert_eq!(stamps_of(&times), (expected, MAX_REFUSED_IN_A_ROW as usize));
+    }
+}
+
+#[test]
+fn a_summary_without_schemas_is_not_trusted() {
+    let (_file, bag) = opened(&without_repeated_schemas(camera_bag(3)), None);
+    let mut bag = bag.unwrap();
+    assert_eq!((bag.num_frames(), bag.take_notice()), (Some(3), None));
+    assert_eq!(play(&mut bag).0, [(0, 0), (1, 1), (2, 2)]);
 }
 
 #[test]
