@@ -53,7 +53,7 @@ typedef enum semidense_status {
 
 // Tracking status of a frame.
 typedef enum semidense_state {
-  // There is no reliable map yet; the pose is provisional.
+  // There is no reliable map and no pose yet: do not use it.
   SEMIDENSE_STATE_INITIALIZING = 0,
   // The pose is accurate to its covariance.
   SEMIDENSE_STATE_TRACKING = 1,

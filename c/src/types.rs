@@ -7,7 +7,7 @@
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum State {
-    /// There is no reliable map yet; the pose is provisional.
+    /// There is no reliable map and no pose yet: do not use it.
     #[default]
     Initializing = 0,
     /// The pose is accurate to its covariance.

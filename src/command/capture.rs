@@ -42,8 +42,8 @@ pub struct SourceArguments {
     /// The same as SOURCE, for scripts written for earlier versions
     #[arg(long = "source", value_name = "SOURCE", hide = true, conflicts_with = "source")]
     source_option: Option<OsString>,
-    /// Rig file with the camera's calibration; required for a camera (v4l) [default: capture.rig of the
-    /// configuration, for the source configured there]
+    /// Rig file with the camera's calibration; required for v4l, ros2 and stream [default: capture.rig of
+    /// the configuration, for the source configured there]
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
     /// Stop with an error at a damaged or missing image of a recording; otherwise such an image is skipped,
@@ -80,10 +80,12 @@ impl SourceArguments {
 /// How frames are paced.
 #[derive(Debug, Clone, Copy, Args)]
 pub struct ModeArguments {
-    /// Process every frame in order; every run gives the same result [default for recordings and the simulator]
+    /// Process every frame in order; every run gives the same result [default of run and capture for recordings
+    /// and the simulator]
     #[arg(long, conflicts_with = "live")]
     pub lockstep: bool,
-    /// Keep the pace of the time stamps; the newest frame wins [default for cameras]
+    /// Keep the pace of the time stamps; the newest frame wins [default for cameras, and of tracker
+    /// and mapper]
     #[arg(long)]
     pub live: bool,
 }

@@ -86,7 +86,7 @@ enum MapCommand {
 /// Have the running mapper save its map now
 #[derive(Debug, Args)]
 struct SaveArguments {
-    /// Folder without a map [default: the folder that the mapper was started with]
+    /// Folder without a map [default: the folder of the map in use]
     #[arg(value_name = "DIR")]
     folder: Option<PathBuf>,
 }
@@ -252,9 +252,8 @@ fn export_map(config: &Config, arguments: &ExportArguments) -> CommandResult {
 fn save(config: &Config, arguments: &SaveArguments) -> CommandResult {
     let folder = arguments.folder.as_ref().map(std::path::absolute).transpose()?;
     ask(config, "map-save", &Command::SaveFolder(folder.clone().unwrap_or_default()))?;
-    let place = folder.map_or("the folder that the mapper was started with".to_owned(), |folder| {
-        folder.display().to_string()
-    });
+    let place = folder
+        .map_or("the folder of the map in use".to_owned(), |folder| folder.display().to_string());
     print(&format!("saved in {place}\n"))?;
     Ok(ExitCode::SUCCESS)
 }
