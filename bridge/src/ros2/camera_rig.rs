@@ -62,12 +62,21 @@ pub fn rig_text(
         return Err(CameraRigError::Uncalibrated);
     }
     let model = match info.distortion_model.as_str() {
-        _ if is_rectified || (!has_lens && info.distortion_model != "equidistant") => "pinhole",
-        "plumb_bob" | "rational_polynomial" => "radtan",
+        _ if is_rectified => "pinhole",
+        // Without coefficients it still is no pinhole.
         "equidistant" | "fisheye" => "equidistant",
+        _ if !has_lens => "pinhole",
+        "plumb_bob" | "rational_polynomial" => "radtan",
         other => return Err(CameraRigError::Model(other.to_owned())),
     };
-    let coefficients = if model == "pinhole" { &[][..] } else { &info.d[..] };
+    // A rig has no coefficients of a thin prism and a tilt, which follow.
+    let most = match model {
+        "pinhole" => 0,
+        "equidistant" => 4,
+        _ => 8,
+    };
+    let is_zero = model == "pinhole" || info.d.iter().skip(most).all(|further| *further == 0.0);
+    let coefficients = if is_zero { &info.d[..info.d.len().min(most)] } else { &info.d[..] };
     let numbers: Vec<String> =
         coefficients.iter().map(|number| format!("{number:?}").to_lowercase()).collect();
     let text = format!(
@@ -119,6 +128,9 @@ mod tests {
             .unwrap();
         let fisheye = rig(&info("equidistant", &[0.0, 0.01, 0.0, 0.0]), false).unwrap();
         assert!(matches!(fisheye.camera.distortion(), Distortion::Equidistant(_)));
+        let ideal = rig(&info("fisheye", &[0.0; 5]), false).unwrap();
+        assert!(matches!(ideal.camera.distortion(), Distortion::Equidistant(_)));
+        rig(&info("rational_polynomial", &[&[0.1; 8][..], &[0.0; 6]].concat()), false).unwrap();
         let rectified = rig(&info("plumb_bob", &[-0.1, 0.02, 0.0, 0.0, 0.0]), true).unwrap();
         assert_eq!(*rectified.camera.distortion(), Distortion::None);
         assert_eq!(rectified.camera.intrinsics().cx, 310.0);

@@ -122,6 +122,7 @@ impl Remote {
                 return false;
             }
             self.begin(envelope.sender);
+            self.rival = None;
         }
         self.heard = Some(now);
         self.clock.set_realtime(envelope.realtime_offset_nanos, realtime_offset_nanos());
@@ -166,6 +167,8 @@ mod tests {
         assert!(remote.silence_reason("rig", "x", now).unwrap().contains("two programs"));
         let later = now + TAKEOVER_AFTER;
         assert!(remote.admit(&envelope(2, 1, 1), Kind::Pose, later));
+        let cause = remote.silence_reason("rig", "x", later).unwrap_or_default();
+        assert!(!cause.contains("two programs"), "only one sends now: {cause}");
     }
 
     #[test]
