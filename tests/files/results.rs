@@ -81,9 +81,12 @@ fn keyframes_of_earlier_runs_are_not_compared() {
         VARIANCES.iter().for_each(|&at| pose.estimate.covariance[at] = 1e-4);
         pose
     };
-    let record = record((0..60).map(certain).collect(), vec![keyframe(0), keyframe(1)], true);
-    for (first_keyframe_id, frames, pixels) in [(0, 60, 40), (1, 20, 20)] {
-        let record = RunRecord { first_keyframe_id, ..record.clone() };
+    // After a restart the keyframes are in the order of their epochs.
+    for (order, first_keyframe_id, frames, pixels) in
+        [([0, 1], 0, 60, 40), ([0, 1], 1, 20, 20), ([1, 0], 1, 20, 20)]
+    {
+        let record = record((0..60).map(certain).collect(), order.map(keyframe).to_vec(), true);
+        let record = RunRecord { first_keyframe_id, ..record };
         let folder = tempfile::tempdir().unwrap();
         let (summary, _) = written(&folder.path().join("out"), &record);
         assert_eq!(summary["keyframes"], 2, "of the map");
