@@ -3,6 +3,7 @@
 
 use std::collections::BTreeSet;
 use std::fs;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -16,6 +17,8 @@ use crate::wire::place::{
     CHECKPOINT_SUFFIX, CLAIM_SUFFIX, JOIN_LOCK, LOADED_MAP_SUFFIX, MEMBERS, POSITION_SUFFIX, Place,
     SUPERVISOR,
 };
+use crate::wire::root_folder::is_mine;
+use crate::wire::unfinished::OWNER_MAY_WRITE;
 
 /// Longest wait before tidying up; the next process that leaves can do it as well.
 const LONGEST_TIDY_WAIT: Duration = Duration::from_secs(1);
@@ -95,10 +98,15 @@ impl Place {
         });
     }
 
-    /// Removes the folders of nodes that never started: a failed start leaves one without its `.node_monitor`, which
-    /// could never be recognised as dead. Only while no process can join.
+    /// Removes nodes that never started: a failed start leaves a folder without its `.node_monitor`, or a process that
+    /// was killed an unfinished one, neither of which could ever be recognised as dead. Only while no process can join.
     fn remove_failed_nodes(&self) {
         let nodes = self.root.join("nodes");
+        for name in self.node_monitors() {
+            if is_unfinished(&nodes.join(format!("{name}_context"))) {
+                let _ = fs::remove_file(nodes.join(name));
+            }
+        }
         for entry in fs::read_dir(&nodes).into_iter().flatten().flatten() {
             let id = entry.file_name().to_string_lossy().into_owned();
             let has_monitor = || self.node_monitors().any(|name| name.contains(&id));
@@ -211,6 +219,12 @@ impl Kind {
     }
 }
 
+/// Whether this is the file about a node's process while it is being made: nobody may read it.
+fn is_unfinished(context: &Path) -> bool {
+    fs::symlink_metadata(context)
+        .is_ok_and(|found| is_mine(&found) && found.mode() & 0o777 == OWNER_MAY_WRITE)
+}
+
 /// Whether a file was written so recently that a successor of its writer may still start. A stamp in the future counts
 /// like one in the past: the clock may have been set.
 fn is_young(path: &Path) -> bool {
@@ -223,6 +237,9 @@ fn is_young(path: &Path) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::Permissions;
+    use std::os::unix::fs::PermissionsExt;
+
     use rustix::thread::Timespec;
 
     use super::*;
@@ -376,8 +393,16 @@ mod tests {
         fs::write(nodes.join("123/x.details"), "").unwrap();
         fs::create_dir_all(nodes.join("456")).unwrap();
         fs::write(nodes.join("p_456.node_monitor"), "").unwrap();
+        // Killed before its monitor was finished.
+        fs::create_dir_all(nodes.join("789")).unwrap();
+        let context = nodes.join("p_789.node_monitor_context");
+        for path in [&nodes.join("p_789.node_monitor"), &context] {
+            fs::write(path, "").unwrap();
+            fs::set_permissions(path, Permissions::from_mode(OWNER_MAY_WRITE)).unwrap();
+        }
         place.tidy();
         assert!(!nodes.join("123").exists() && nodes.join("456").exists());
+        assert!(!nodes.join("789").exists());
         fs::remove_file(nodes.join("p_456.node_monitor")).unwrap();
         fs::create_dir(folder.path().join("services")).unwrap();
         fs::write(folder.path().join("services/x.service"), "").unwrap();

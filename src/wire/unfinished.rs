@@ -17,8 +17,9 @@ use crate::wire::root_folder::is_mine;
 const LONGEST_MAKING: Duration = Duration::from_millis(500);
 /// Time between two looks at unfinished files.
 const PAUSE: Timespec = Timespec { tv_sec: 0, tv_nsec: 10_000_000 };
-/// Permission of the owner to write: a finished description of a service has it no longer.
-const OWNER_MAY_WRITE: u32 = 0o200;
+/// Permission of the owner to write: a finished description of a service has it no longer, and what is being made about
+/// the process of a node has no other.
+pub(in crate::wire) const OWNER_MAY_WRITE: u32 = 0o200;
 
 impl Place {
     /// Removes segments without a size and unfinished descriptions of services; waits for those that a living process
