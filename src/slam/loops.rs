@@ -328,7 +328,7 @@ impl Loops {
         let (other, (compared, outcome)) = match &job.plan.stage {
             Stage::Search => (job.plan.pairs.first().map(|pair| pair.j), self.search(&job)),
             Stage::Confirm(link) => (Some(link.j), self.confirm(&job, link)),
-            Stage::Close { num_newest } => (None, (0, self.solve(&job, *num_newest))),
+            Stage::Close { num_newest } => (None, (0, self.settle(&job, *num_newest))),
         };
         if outcome != SearchOutcome::Proposed && self.record.searched_to.is_none_or(|to| to < of) {
             self.mark_searched(of);

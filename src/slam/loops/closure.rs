@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::{GraphParams, optimise};
-use crate::slam::keyframe::Keyframe;
+use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::loops::chain::Chain;
 use crate::slam::loops::record::Link;
 use crate::slam::loops::search::LARGEST_CHI2;
@@ -36,23 +36,32 @@ impl Closure {
 impl Loops {
     /// Adds a confirmed loop as a constraint, unless it contradicts the earlier ones.
     pub(super) fn close(&mut self, job: &Job, confirmed: &[Link]) -> SearchOutcome {
-        let before = self.record.links.len();
         Arc::make_mut(&mut self.record).links.extend(confirmed);
-        let outcome = self.solve(job, confirmed.len());
+        self.settle(job, confirmed.len())
+    }
+
+    /// Solves for the effect of the newest loops on the map, and drops them if they contradict it.
+    pub(super) fn settle(&mut self, job: &Job, num_newest: usize) -> SearchOutcome {
+        let outcome = self.solve(job, num_newest);
         if outcome == SearchOutcome::Inconsistent {
+            let before = self.record.links.len().saturating_sub(num_newest);
             Arc::make_mut(&mut self.record).links.truncate(before);
         }
         outcome
     }
 
-    /// Solves for the effect of the newest loops on the map: a pair, or those that join two epochs.
-    pub(super) fn solve(&mut self, job: &Job, num_newest: usize) -> SearchOutcome {
+    /// The newest loops are a pair, or those that join two epochs.
+    fn solve(&mut self, job: &Job, num_newest: usize) -> SearchOutcome {
         let links = &self.record.links;
         let first = links.len().checked_sub(num_newest).and_then(|at| links.get(at));
         let Some(first) = first.copied() else { return SearchOutcome::Inconsistent };
         let (Some(i), Some(j)) = (job.node(first.i), job.node(first.j)) else {
             return SearchOutcome::Inconsistent;
         };
+        // Since the search, where the result could not be applied at once.
+        if [i, j].iter().any(|of| of.map_state == MapState::Rejected) {
+            return SearchOutcome::Inconsistent;
+        }
         match i.epoch == j.epoch {
             true => self.solve_graph(job, i.epoch, num_newest),
             false => self.join(job, &first, [i, j]),

@@ -4,6 +4,7 @@ use super::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Twist7;
 use crate::slam::graph::constraint::tests::{DepthError, USUAL, keyframe};
+use crate::slam::keyframe::MapState;
 use crate::slam::keyframe_pose_covariance::{KeyframePoseCovariance, KeyframePoseMatrix};
 use crate::slam::loops::chain::Chain;
 use crate::slam::map::Correction;
@@ -287,6 +288,14 @@ fn a_closure_that_was_not_applied_is_repeated() {
     assert!(course.loops.begin(&course.map));
     course.loops.run();
     assert_eq!(course.loops.take_closure(), closed);
+    // The map was rejected meanwhile.
+    course.loops.closure = closed;
+    course.loops.repeat_closure();
+    course.map.keyframes.iter_mut().for_each(|of| of.map_state = MapState::Rejected);
+    assert!(course.loops.begin(&course.map));
+    course.loops.run();
+    assert_eq!(course.loops.take_closure(), None);
+    assert_eq!(course.loops.record().links, []);
 }
 
 #[test]

@@ -42,8 +42,11 @@ impl Mapper {
 
     /// Applies a loop closure to the map; odometry keeps the camera's pose and its unit.
     pub(super) fn close_loop(&mut self, closure: &Closure, window: &mut Window) -> StepOutcome {
-        let is_active = self.keyframe().is_some_and(|active| active.epoch == closure.epoch);
-        let unit = closure.moves.last().map(|(_, by)| by.scale).filter(|_| is_active);
+        let active = self.keyframe().filter(|active| active.epoch == closure.epoch);
+        let is_active = active.is_some();
+        // Not necessarily of the newest keyframe: the camera may have returned to an older one.
+        let by = active.and_then(|active| closure.of(active.keyframe_id, active.epoch));
+        let unit = by.map(|by| by.scale);
         let moved = |keyframe: &Keyframe| {
             let by = closure.of(keyframe.keyframe_id, keyframe.epoch)?;
             Some(KeyframeCorrection {
@@ -114,7 +117,12 @@ mod tests {
     fn a_loop_moves_the_map_and_leaves_odometry_and_its_unit_unchanged() {
         let mut mapper = mapper();
         let by = Sim3::new(sideways(0.5), 1.2);
-        let closure = Closure { epoch: 0, moves: vec![(0, Sim3::identity()), (1, by)], join: None };
+        // A newer keyframe that was left again is stretched more.
+        let newer = Sim3::new(sideways(0.5), 1.5);
+        let scene = Scene::new(3);
+        mapper.map.keyframes.push(scene.keyframe(2, sideways(2.0), 1.0));
+        let moves = vec![(0, Sim3::identity()), (1, by), (2, newer)];
+        let closure = Closure { epoch: 0, moves, join: None };
         let before = mapper.map.revision;
         let outcome = mapper.close_loop(&closure, &mut window());
         assert!(outcome.graph_changed && outcome.keyframe_changed);
