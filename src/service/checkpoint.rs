@@ -42,7 +42,7 @@ impl Kept {
             None
         });
         let mut reservation = left.as_ref().map_or_else(Map::default, as_written);
-        reservation.reserve_epochs();
+        reservation.reserve_numbers();
         match Checkpoint::keep(path) {
             Ok(checkpoint) => {
                 let reservation = Some(reservation);
@@ -217,9 +217,11 @@ fn as_written(read: &Map) -> Map {
 fn write_keyframe(path: &Path, keyframe: Keyframe) {
     let file = keyframe_file(path, keyframe.keyframe_id);
     write_or_warn(&file, &Map { keyframes: vec![keyframe], ..Map::default() });
-    let files = keyframe_files(path);
-    let surplus = files.len().saturating_sub(KEPT_KEYFRAMES);
-    files.into_iter().take(surplus).for_each(|(_, file)| drop(fs::remove_file(file)));
+    // The clock may have been set back: then this one has the earliest stamp.
+    let others = keyframe_files(path).into_iter().filter(|(_, other)| *other != file);
+    let others: Vec<_> = others.collect();
+    let surplus = (others.len() + 1).saturating_sub(KEPT_KEYFRAMES);
+    others.into_iter().take(surplus).for_each(|(_, file)| drop(fs::remove_file(file)));
 }
 
 /// File of a keyframe before the active one.
@@ -409,6 +411,14 @@ mod tests {
         let ids: Vec<u64> = keyframe_files(&path).into_iter().map(|(id, _)| id).collect();
         let kept = 100 + KEPT_KEYFRAMES as u64;
         assert_eq!(ids, (102..kept).chain([5, 6]).collect::<Vec<u64>>());
+        // The clock is set back by an hour.
+        for (_, file) in keyframe_files(&path) {
+            let ahead = SystemTime::now() + Duration::from_secs(3600);
+            fs::File::options().write(true).open(file).unwrap().set_modified(ahead).unwrap();
+        }
+        written(7);
+        let files = keyframe_files(&path);
+        assert_eq!((files.len(), files[0].0), (KEPT_KEYFRAMES, 7));
     }
 
     #[test]

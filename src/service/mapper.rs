@@ -348,6 +348,9 @@ impl<'a> Shell<'a> {
         let mut mapper = Mapper::new(intrinsics, self.config.mapping.clone())
             .map_err(|error| RunError::Parameter("mapping", error))?;
         self.output.open_images(&self.hub, &intrinsics)?;
+        if let Err(error) = self.save_map_folder() {
+            self.health.warn(&format!("the map on disk lacks its last keyframes: {error}"));
+        }
         if let Some((_, before)) = self.mapper.take() {
             self.health.counters().resized += 1;
             mapper.continue_from(before);

@@ -15,16 +15,28 @@ const UNKNOWN_REVISIONS: u64 = 1_000_000;
 const UNKNOWN_EPOCHS: u32 = 16;
 
 impl Map {
-    /// Reserves epoch numbers in `self`, the checkpoint of a dead mapper if any. Write it before numbering anything:
-    /// the next mapper then uses other epoch numbers, even if this one dies without another checkpoint.
-    pub fn reserve_epochs(&mut self) {
+    /// Reserves numbers in `self`, the checkpoint of a dead mapper if any. Write it before numbering anything: the next
+    /// mapper then uses others, even if this one dies without another checkpoint.
+    pub fn reserve_numbers(&mut self) {
         self.free_epoch = self.free_epoch.saturating_add(UNKNOWN_EPOCHS);
     }
 
-    /// First keyframe number that a mapper which died some time after this checkpoint has not assigned.
+    /// First keyframe number that none of the mappers which died since this checkpoint has assigned.
     pub fn free_keyframe_id(&self) -> u64 {
         let newest = self.keyframes.iter().map(|keyframe| keyframe.keyframe_id).max();
-        newest.unwrap_or(0).saturating_add(UNKNOWN_KEYFRAMES)
+        newest.unwrap_or(0).saturating_add(UNKNOWN_KEYFRAMES * self.reservations())
+    }
+
+    /// First revision that none of them has assigned.
+    fn free_revision(&self) -> u64 {
+        let newest = self.keyframes.iter().map(|keyframe| keyframe.revision).max();
+        newest.unwrap_or(0).saturating_add(UNKNOWN_REVISIONS * self.reservations())
+    }
+
+    /// At least the number of mappers that have reserved numbers since the checkpoint, and one: each of them may have
+    /// assigned keyframe ids and revisions beyond those of the one before.
+    fn reservations(&self) -> u64 {
+        u64::from(self.free_epoch / UNKNOWN_EPOCHS).max(1)
     }
 }
 
@@ -95,8 +107,7 @@ impl Mapper {
             return StepOutcome::default();
         }
         // The dead mapper may have assigned numbers after its last checkpoint: skip these.
-        let newest_revision = map.keyframes.iter().map(|keyframe| keyframe.revision).max();
-        self.revision = newest_revision.unwrap_or(0).saturating_add(UNKNOWN_REVISIONS);
+        self.revision = map.free_revision();
         self.next_keyframe_id = map.free_keyframe_id();
         self.first_free_epoch = map.free_epoch;
         let was_active = map.active.and_then(|active| map.index_of(active));
@@ -146,23 +157,27 @@ mod tests {
         }
     }
 
-    /// The checkpoint of a mapper that dies after its start, and the number of its first epoch.
-    fn short_life(left: Option<Map>) -> (Map, u32) {
+    /// The checkpoint of a mapper that dies after its start, and its first numbers: epoch, keyframe and revision.
+    fn short_life(left: Option<Map>) -> (Map, (u32, u64, u64)) {
         let mut reserved = left.clone().unwrap_or_default();
-        reserved.reserve_epochs();
+        reserved.reserve_numbers();
         let mut mapper = mapper();
         if let Some(map) = left {
             mapper.resume(map);
         }
-        (reserved, mapper.free_epoch())
+        (reserved, (mapper.free_epoch(), mapper.free_keyframe_id(), mapper.revision))
     }
 
     #[test]
-    fn no_epoch_reuses_the_number_of_one_that_was_never_proven() {
+    fn no_mapper_reuses_numbers_of_one_that_died_without_a_checkpoint() {
         let (left, first) = short_life(None);
         let (left, second) = short_life(Some(left));
         let (_, third) = short_life(Some(left));
-        assert!(first == 0 && 0 < second && second < third, "{first} {second} {third}");
+        assert_eq!(first, (0, 0, 0));
+        assert!(second.0 > first.0 && third.0 > second.0, "{second:?} {third:?}");
+        assert!(second.1 >= UNKNOWN_KEYFRAMES && second.2 >= UNKNOWN_REVISIONS, "{second:?}");
+        assert!(third.1 - second.1 >= UNKNOWN_KEYFRAMES, "{second:?} {third:?}");
+        assert!(third.2 - second.2 >= UNKNOWN_REVISIONS, "{second:?} {third:?}");
     }
 
     #[test]
