@@ -70,8 +70,10 @@ pub fn run(config: &Config, options: &CaptureOptions, shutdown: &Shutdown) -> Re
 enum Sent {
     /// It was sent, with this sequence.
     Frame(u64),
-    /// The frame was damaged.
-    Nothing,
+    /// It is no newer than the last one of the previous capture.
+    Repeated,
+    /// It was damaged.
+    Damaged,
     /// No frame is left.
     End,
 }
@@ -95,6 +97,8 @@ struct Shell<'a> {
     pace: Option<Pace>,
     /// Why the camera is absent, while it is.
     absence: Option<String>,
+    /// Since when (CLOCK_MONOTONIC) a camera has delivered only damaged frames, and what is wrong with the first.
+    damaged: Option<(i64, String)>,
     /// Images of a recording that could not be used.
     refused: RefusedImages,
     /// First sequence of a camera's frames.
@@ -157,6 +161,7 @@ impl<'a> Shell<'a> {
             health,
             pace: None,
             absence: None,
+            damaged: None,
             refused: RefusedImages::default(),
             first_sequence: 0,
             predecessor: Predecessor::default(),
@@ -244,10 +249,14 @@ impl<'a> Shell<'a> {
         loop {
             if self.await_frame()? {
                 match self.send_next()? {
-                    Sent::Frame(sequence) if self.mode == Mode::Lockstep => {
-                        self.await_step(sequence)?;
+                    Sent::Frame(sequence) => {
+                        self.accept();
+                        if self.mode == Mode::Lockstep {
+                            self.await_step(sequence)?;
+                        }
                     }
-                    Sent::Frame(_) | Sent::Nothing => {}
+                    Sent::Repeated => self.accept(),
+                    Sent::Damaged => {}
                     Sent::End => return Ok(()),
                 }
             }
@@ -269,29 +278,34 @@ impl<'a> Shell<'a> {
         if self.shutdown.is_requested() {
             return Err(RunError::Interrupted);
         }
-        match arrival {
-            Arrival::Frame => {
-                match self.absence.take().map(|_| self.next_sequence) {
-                    Some(None) => tracing::info!("capture: frames are arriving"),
-                    Some(Some(_)) => tracing::warn!("capture: frames are arriving again"),
-                    None => {}
-                }
-                self.health.enter(ProcessState::Running, &self.refused.text().unwrap_or_default());
-                return Ok(true);
-            }
-            Arrival::Nothing => {}
-            Arrival::Absent(reason) => {
-                self.health.enter(ProcessState::Stale, &reason);
-                if self.absence.as_ref() != Some(&reason) {
-                    // A supervisor prints it itself.
-                    if !is_supervised() {
-                        tracing::warn!("capture: {reason}");
-                    }
-                    self.absence = Some(reason);
-                }
-            }
+        if let Arrival::Absent(reason) = arrival {
+            self.report_absence(reason);
+            return Ok(false);
         }
-        Ok(false)
+        Ok(arrival == Arrival::Frame)
+    }
+
+    fn report_absence(&mut self, reason: String) {
+        self.health.enter(ProcessState::Stale, &reason);
+        if self.absence.as_ref() != Some(&reason) {
+            // A supervisor prints it itself.
+            if !is_supervised() {
+                tracing::warn!("capture: {reason}");
+            }
+            self.absence = Some(reason);
+        }
+    }
+
+    /// Notes a usable frame.
+    fn accept(&mut self) {
+        let is_first = self.refused.accept();
+        self.damaged = None;
+        match self.absence.take().map(|_| is_first) {
+            Some(true) => tracing::info!("capture: frames are arriving"),
+            Some(false) => tracing::warn!("capture: frames are arriving again"),
+            None => {}
+        }
+        self.health.enter(ProcessState::Running, &self.refused.text().unwrap_or_default());
     }
 
     /// Copies a camera's losses into the health.
@@ -315,15 +329,14 @@ impl<'a> Shell<'a> {
             }
             Err(error) if error.is_transient() && !self.ends_at(&error) => {
                 self.refuse(&error);
-                return Ok(Sent::Nothing);
+                return Ok(Sent::Damaged);
             }
             Err(error) => return Err(error.into()),
         };
-        self.refused.accept();
         stamp.sequence = stamp.sequence.saturating_add(self.first_sequence);
         if self.predecessor.is_ahead_of(&stamp) {
             self.health.counters().disordered += 1;
-            return Ok(Sent::Nothing);
+            return Ok(Sent::Repeated);
         }
         if self.shutdown.is_requested() {
             return Err(RunError::Interrupted);
@@ -362,13 +375,22 @@ impl<'a> Shell<'a> {
         self.config.capture.strict && matches!(error, SourceError::Image(_))
     }
 
-    /// Leaves a frame out: a camera counts its own, those of a recording are also named.
+    /// Leaves a frame out: a camera counts its own, those of a recording are also named. A camera that delivers nothing
+    /// else is as good as absent.
     fn refuse(&mut self, error: &SourceError) {
         if !self.is_recorded() {
             tracing::debug!("{error}");
+            let (since, first) =
+                self.damaged.get_or_insert_with(|| (now_nanos(), error.to_string()));
+            let damaged_s = now_nanos().saturating_sub(*since) as f64 * 1e-9;
+            if damaged_s >= self.config.capture.camera.stall_s {
+                let reason = format!("every frame is damaged: {first}");
+                self.report_absence(reason);
+            }
             return;
         }
         self.refused.refuse(error);
+        self.health.enter(ProcessState::Running, &self.refused.text().unwrap_or_default());
         self.health.counters().refused = self.refused.count();
         // Its place in the sequence stays empty, which is not a gap: the next expected number skips it.
         self.next_sequence = self.next_sequence.map(|next| next.saturating_add(1));

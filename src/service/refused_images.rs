@@ -27,12 +27,14 @@ impl RefusedImages {
         self.log();
     }
 
-    /// Notes a good image.
-    pub fn accept(&mut self) {
-        if !self.has_good_image {
+    /// Notes a good image; returns whether it is the first.
+    pub fn accept(&mut self) -> bool {
+        let is_first = !self.has_good_image;
+        if is_first {
             self.has_good_image = true;
             self.log();
         }
+        is_first
     }
 
     fn log(&mut self) {

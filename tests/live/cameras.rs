@@ -100,6 +100,49 @@ fn the_first_frames_of_a_stream_cause_no_warning() {
 }
 
 #[test]
+fn a_stream_of_damaged_pictures_is_a_state_with_its_reason() {
+    let rig = Rig::new();
+    let socket = rig.folder().join("frames");
+    let source = format!("stream:{}", socket.display());
+    let arguments = ["--rig", WEBCAM, "--set", "capture.camera.stall_s=0.3"];
+    let child = start(&rig, "capture", &source, &arguments).spawn().unwrap();
+    let capture_in = |state: &str| {
+        let status = finish(rig.command(&["status", "--once", "--json"]));
+        let status: Value = serde_json::from_str(&status.stdout).ok()?;
+        (status["capture"]["state"] == state).then(|| status["capture"].clone())
+    };
+    until("that it waits", || capture_in("stale"));
+    let mut sender = UnixStream::connect(&socket).unwrap();
+    let mut sequence = 0;
+    let mut send = |is_damaged: bool| {
+        let stamp_nanos = 1_000_000 * sequence as i64;
+        let header = StreamHeader::gray((640, 480), StreamClock::Other, stamp_nanos, sequence);
+        let mut header = header.to_bytes();
+        if is_damaged {
+            // A JPEG, which has no rows: grey pixels are not one.
+            header[16..20].fill(0);
+            header[20..24].copy_from_slice(b"MJPG");
+        }
+        sender.write_all(&header).unwrap();
+        sender.write_all(&vec![90; 640 * 480]).unwrap();
+        sequence += 1;
+    };
+    let found = until("the damage", || {
+        send(true);
+        let found = capture_in("stale")?;
+        found["cause"].as_str()?.starts_with("every frame is damaged: ").then_some(found)
+    });
+    assert!(found["refused"].as_u64() > Some(1), "{found}");
+    until("that it runs", || {
+        send(false);
+        capture_in("running")
+    });
+    signal(&child, Signal::INT);
+    let ended = end(child);
+    assert_eq!(ended.stderr.matches("every frame is damaged").count(), 1, "{}", ended.stderr);
+}
+
+#[test]
 fn a_run_prints_once_that_it_waits_for_a_camera() {
     let rig = Rig::new();
     for more in [&[][..], &["--json"]] {

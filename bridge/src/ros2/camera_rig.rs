@@ -75,8 +75,8 @@ pub fn rig_text(
         "equidistant" => 4,
         _ => 8,
     };
-    let is_zero = model == "pinhole" || info.d.iter().skip(most).all(|further| *further == 0.0);
-    let coefficients = if is_zero { &info.d[..info.d.len().min(most)] } else { &info.d[..] };
+    let fits = model == "pinhole" || info.d.iter().skip(most).all(|further| *further == 0.0);
+    let coefficients = if fits { &info.d[..info.d.len().min(most)] } else { &info.d[..] };
     let numbers: Vec<String> =
         coefficients.iter().map(|number| format!("{number:?}").to_lowercase()).collect();
     let text = format!(

@@ -237,8 +237,9 @@ impl<S: VideoSystem> Camera<S> {
         if silent_nanos as f64 > self.params.stall_s * 1e9 {
             let path = stream.path.display();
             let seconds = self.params.stall_s;
+            let what = if self.refused_in_a_row > 0 { "only damaged frames" } else { "no frame" };
             return Err(Absence::transient(format!(
-                "{path}: has delivered no frame for {seconds} s"
+                "{path}: has delivered {what} for {seconds} s"
             )));
         }
         Ok(Arrival::Nothing)
@@ -280,7 +281,10 @@ impl<S: VideoSystem> Camera<S> {
                 Err(error) => return Err(stream.absence(error)),
             };
             count += 1;
-            stream.newest_nanos = arrival_nanos;
+            let is_damaged = filled.flags & FLAG_ERROR != 0;
+            if !is_damaged {
+                stream.newest_nanos = arrival_nanos;
+            }
             let (sequence, missing) = self.numbers.number(filled.sequence);
             self.losses.missing += missing;
             let mut taken = taken(&filled, arrival_nanos, stream.exposure.nanos, offset_nanos);
@@ -291,8 +295,7 @@ impl<S: VideoSystem> Camera<S> {
                 taken.nanos =
                     before.map_or(taken.nanos, |before| taken.nanos.max(before.saturating_add(1)));
             }
-            let is_broken = filled.flags & FLAG_ERROR != 0
-                || before.is_some_and(|before| taken.nanos <= before);
+            let is_broken = is_damaged || before.is_some_and(|before| taken.nanos <= before);
             self.refused_in_a_row = if is_broken { self.refused_in_a_row + 1 } else { 0 };
             if is_broken {
                 self.losses.broken += 1;

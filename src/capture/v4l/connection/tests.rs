@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::capture::v4l::fake::{Event, Fake, frame};
-use crate::capture::v4l::kernel::FLAG_TIMESTAMP_MONOTONIC;
+use crate::capture::v4l::kernel::{FLAG_ERROR, FLAG_TIMESTAMP_MONOTONIC};
 use crate::capture::v4l::params::Setting;
 
 const FRAME_NANOS: i64 = 33_000_000;
@@ -212,6 +212,29 @@ fn a_camera_that_falls_silent_is_reopened() {
     assert_eq!(reason.as_deref(), Some("/dev/video0: has delivered no frame for 2 s"));
     come_back(&mut camera);
     assert_eq!((take(&fake, &mut camera, 0), fake.opened()), (2, 2));
+}
+
+#[test]
+fn a_camera_whose_frames_are_all_damaged_is_reopened() {
+    let fake = Fake::default();
+    let mut camera = camera(&fake);
+    take(&fake, &mut camera, 0);
+    let damaged = |sequence| {
+        let (bytes, flags) = (vec![7; 640 * 480], FLAG_TIMESTAMP_MONOTONIC | FLAG_ERROR);
+        Event::Frame { bytes, used: None, sequence, flags, age_nanos: 0 }
+    };
+    let mut reason = None;
+    for sequence in 1..200 {
+        fake.pass(FRAME_NANOS);
+        fake.give(damaged(sequence));
+        if let Arrival::Absent(text) = camera.await_frame(None, 10).unwrap() {
+            reason = Some(text);
+            break;
+        }
+    }
+    assert_eq!(reason.as_deref(), Some("/dev/video0: has delivered only damaged frames for 2 s"));
+    come_back(&mut camera);
+    assert_eq!(fake.opened(), 2);
 }
 
 #[test]
