@@ -84,6 +84,7 @@ class Reader:
         self._ports: Optional[Ports] = None
         self._states: Dict[str, ProcessState] = {}
         self._heard = time.monotonic()
+        self._runs = 0
         # Depth whose image has not arrived, and the newest image, which serves every revision of its keyframe's depth.
         self._depth: Optional[Tuple[Any, Any]] = None
         self._image: Optional[Tuple[Any, Any]] = None
@@ -113,6 +114,7 @@ class Reader:
             return False
         self._states.clear()
         self._heard = time.monotonic()
+        self._runs += 1
         return True
 
     def read(self, timeout: float = 0.0) -> List[Message]:
@@ -157,6 +159,9 @@ class Reader:
                     self._ports.wait(WAIT_SECS)
             if not self._follow:
                 return
+            if not self._is_known:
+                # That run was over before it was joined.
+                time.sleep(RETRY_SECS)
             self._join()
 
     def _is_over(self) -> bool:
@@ -172,8 +177,17 @@ class Reader:
             self._heard = time.monotonic()
         return sample
 
+    @property
+    def _is_known(self) -> bool:
+        """Whether a process of this run is known to continue; of the first run everything is read."""
+        return self._runs < 2 or any(state is not ProcessState.FINISHED for state in self._states.values())
+
     def _take(self) -> Iterator[Message]:
-        """All unread messages, keyframes before the poses that name them; of replaceable ones only the newest."""
+        """All unread messages, keyframes before the poses that name them; of replaceable ones only the newest.
+
+        The end of a run that is mirrored from another machine stays visible for some seconds: a next run is read once
+        one of its processes has reported.
+        """
         takes: Dict[type, Callable[[], Iterator[Message]]] = {
             Keyframe: self._keyframe,
             Graph: self._graph,
@@ -182,7 +196,7 @@ class Reader:
         }
         yield from self._health()
         for kind, take in takes.items():
-            if kind in self._kinds:
+            if kind in self._kinds and self._is_known:
                 yield from take()
 
     def _checked(self, make: Callable[[], M]) -> Iterator[M]:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from types import SimpleNamespace
 from typing import Any, Dict
 
 import numpy as np
@@ -16,7 +17,7 @@ import pytest
 from conftest import WATCH_DOG_SECS, Rig, until
 
 import semidense
-from semidense import Frame, Graph, Health, Keyframe, Pose, Reader, State
+from semidense import Frame, Graph, Health, Keyframe, Pose, ProcessState, Reader, State, _wire
 
 
 def options(rig: Rig) -> Dict[str, Any]:
@@ -192,6 +193,43 @@ def test_the_loop_ends_with_the_run_and_follows_to_the_next(rig: Rig) -> None:
         return is_before
 
     until(has_begun_anew)
+
+
+class Topic:
+    """A topic with the messages of its publisher, which late subscribers get as well."""
+
+    def __init__(self, *messages: Any) -> None:
+        self.messages = list(messages)
+
+    def receive(self) -> Any:
+        taken = [self.messages.pop(0)] if self.messages else []
+        return SimpleNamespace(payload=lambda: taken) if taken else None
+
+
+def test_the_end_of_a_mirrored_run_is_not_read_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    finished, running = ProcessState.FINISHED.value, ProcessState.RUNNING.value
+    # Twice the first run, whose end a mirror shows for some time, then the next.
+    runs = iter([(41, finished), (41, finished), (7, running)])
+
+    class Shown:
+        def __init__(self, *_: Any) -> None:
+            sequence, state = next(runs)
+            health = [Topic(_wire.HealthMessage(state=state)) for _ in range(3)]
+            self.subscribers = dict(zip(["capture/health", "tracker/health", "mapper/health"], health))
+            pose = _wire.PoseMessage(state=1, sequence=sequence)
+            for place in (pose.world_from_camera, pose.map_from_camera, pose.keyframe_from_camera):
+                place[3] = 1.0
+            self.subscribers["tracker/pose"] = Topic(pose)
+
+        def wait(self, _: float) -> None:
+            pass
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(semidense.reader, "Ports", Shown)
+    poses = semidense.poses(follow=True)
+    assert [next(poses).sequence for _ in range(2)] == [41, 7]
 
 
 def test_a_read_without_a_timeout_notices_the_end_of_the_run(rig: Rig) -> None:
