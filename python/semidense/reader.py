@@ -37,6 +37,7 @@ _PATHS: Dict[type, Tuple[str, ...]] = {
     Health: ("capture/health", "tracker/health", "mapper/health"),
 }
 _HEALTH = _PATHS[Health]
+_GOING_ON = (ProcessState.STARTING, ProcessState.PREPARING, ProcessState.READY, ProcessState.RUNNING)
 # Health is sent at least once a second, so it needs no wake-up.
 _WAKES: Dict[type, Tuple[str, ...]] = {
     Pose: ("tracker/pose",),
@@ -85,6 +86,9 @@ class Reader:
         self._states: Dict[str, ProcessState] = {}
         self._heard = time.monotonic()
         self._runs = 0
+        # Whether a process of the run is known to go on: the end of a run that is mirrored from another machine stays
+        # visible, and is not the next run.
+        self._is_known = True
         # Depth whose image has not arrived, and the newest image, which serves every revision of its keyframe's depth.
         self._depth: Optional[Tuple[Any, Any]] = None
         self._image: Optional[Tuple[Any, Any]] = None
@@ -115,6 +119,7 @@ class Reader:
         self._states.clear()
         self._heard = time.monotonic()
         self._runs += 1
+        self._is_known = self._runs == 1
         return True
 
     def read(self, timeout: float = 0.0) -> List[Message]:
@@ -177,17 +182,8 @@ class Reader:
             self._heard = time.monotonic()
         return sample
 
-    @property
-    def _is_known(self) -> bool:
-        """Whether a process of this run is known to continue; of the first run everything is read."""
-        return self._runs < 2 or any(state is not ProcessState.FINISHED for state in self._states.values())
-
     def _take(self) -> Iterator[Message]:
-        """All unread messages, keyframes before the poses that name them; of replaceable ones only the newest.
-
-        The end of a run that is mirrored from another machine stays visible for some seconds: a next run is read once
-        one of its processes has reported.
-        """
+        """All unread messages, keyframes before the poses that name them; of replaceable ones only the newest."""
         takes: Dict[type, Callable[[], Iterator[Message]]] = {
             Keyframe: self._keyframe,
             Graph: self._graph,
@@ -195,8 +191,11 @@ class Reader:
             Pose: self._poses,
         }
         yield from self._health()
+        if not self._is_known:
+            self._discard()
+            return
         for kind, take in takes.items():
-            if kind in self._kinds and self._is_known:
+            if kind in self._kinds:
                 yield from take()
 
     def _checked(self, make: Callable[[], M]) -> Iterator[M]:
@@ -214,8 +213,17 @@ class Reader:
                 for message in sample.payload():
                     for health in self._checked(lambda m=message, p=process: Health(p, m)):  # type: ignore[misc]
                         self._states[process] = health.state
-                        if Health in self._kinds:
+                        self._is_known |= health.state in _GOING_ON
+                        if Health in self._kinds and self._is_known:
                             yield health
+
+    def _discard(self) -> None:
+        """Drops what is left of a run whose processes have all ended, as far as they have reported."""
+        if self._ports is None or not self._states:
+            return
+        for path in self._ports.subscribers:
+            while path not in _HEALTH and self._receive(path) is not None:
+                pass
 
     def _poses(self) -> Iterator[Pose]:
         while (sample := self._receive("tracker/pose")) is not None:

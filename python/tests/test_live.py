@@ -207,22 +207,34 @@ class Topic:
 
 
 def test_the_end_of_a_mirrored_run_is_not_read_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    finished, running = ProcessState.FINISHED.value, ProcessState.RUNNING.value
-    # Twice the first run, whose end a mirror shows for some time, then the next.
-    runs = iter([(41, finished), (41, finished), (7, running)])
+    running, finished = ProcessState.RUNNING, ProcessState.FINISHED
+    failed, stale = ProcessState.FAILED, ProcessState.STALE
+    paths = ["capture/health", "tracker/health", "mapper/health"]
+
+    def pose(sequence: int) -> Any:
+        message = _wire.PoseMessage(state=1, sequence=sequence)
+        for place in (message.world_from_camera, message.map_from_camera, message.keyframe_from_camera):
+            place[3] = 1.0
+        return message
+
+    # A run that is interrupted, and its end, which a mirror shows first as it is and then as stale, until the next.
+    runs = iter([[failed, finished, finished], [failed, finished, finished], [stale] * 3])
 
     class Shown:
         def __init__(self, *_: Any) -> None:
-            sequence, state = next(runs)
-            health = [Topic(_wire.HealthMessage(state=state)) for _ in range(3)]
-            self.subscribers = dict(zip(["capture/health", "tracker/health", "mapper/health"], health))
-            pose = _wire.PoseMessage(state=1, sequence=sequence)
-            for place in (pose.world_from_camera, pose.map_from_camera, pose.keyframe_from_camera):
-                place[3] = 1.0
-            self.subscribers["tracker/pose"] = Topic(pose)
+            states = next(runs)
+            health = [Topic(_wire.HealthMessage(state=state.value)) for state in states]
+            self.subscribers = dict(zip(paths, health))
+            self.subscribers["tracker/pose"] = Topic(pose(41))
+            self.is_stale = stale in states
 
         def wait(self, _: float) -> None:
-            pass
+            assert self.is_stale
+            self.subscribers["tracker/health"].messages.append(_wire.HealthMessage(state=running.value))
+            self.subscribers["tracker/pose"].messages.append(pose(7))
+            # All processes end before the reader looks again.
+            for path in paths:
+                self.subscribers[path].messages.append(_wire.HealthMessage(state=finished.value))
 
         def close(self) -> None:
             pass

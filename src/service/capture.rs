@@ -279,6 +279,7 @@ impl<'a> Shell<'a> {
             return Err(RunError::Interrupted);
         }
         if let Arrival::Absent(reason) = arrival {
+            self.damaged = None;
             self.report_absence(reason);
             return Ok(false);
         }

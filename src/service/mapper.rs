@@ -348,15 +348,18 @@ impl<'a> Shell<'a> {
         let mut mapper = Mapper::new(intrinsics, self.config.mapping.clone())
             .map_err(|error| RunError::Parameter("mapping", error))?;
         self.output.open_images(&self.hub, &intrinsics)?;
-        if let Err(error) = self.save_map_folder() {
-            self.health.warn(&format!("the map on disk lacks its last keyframes: {error}"));
-        }
+        let unsaved = self.save_map_folder().err();
         if let Some((_, before)) = self.mapper.take() {
             self.health.counters().resized += 1;
             mapper.continue_from(before);
             self.adjustments.abandon();
             if self.map.take().is_some() {
-                self.health.warn("the camera has changed: frames of the new one are not added to the map on disk");
+                let unsaved = unsaved
+                    .map(|error| format!(", which lacks the last ones of the other: {error}"));
+                self.health.warn(&format!(
+                    "the camera has changed: frames of the new one are not added to the map on disk{}",
+                    unsaved.unwrap_or_default()
+                ));
             }
         }
         let left = self.left.take();

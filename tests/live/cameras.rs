@@ -3,6 +3,8 @@
 
 use std::io::Write;
 use std::os::unix::net::UnixStream;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use crate::support::{Ended, Rig, end, finish, signal, until};
 use rustix::process::Signal;
@@ -101,10 +103,13 @@ fn the_first_frames_of_a_stream_cause_no_warning() {
 
 #[test]
 fn a_stream_of_damaged_pictures_is_a_state_with_its_reason() {
+    const PERIOD: Duration = Duration::from_millis(20);
+    /// Five minutes: longer than what is waited for.
+    const MAX_FRAMES: u64 = 15_000;
     let rig = Rig::new();
     let socket = rig.folder().join("frames");
     let source = format!("stream:{}", socket.display());
-    let arguments = ["--rig", WEBCAM, "--set", "capture.camera.stall_s=0.3"];
+    let arguments = ["--rig", WEBCAM, "--set", "capture.camera.stall_s=1"];
     let child = start(&rig, "capture", &source, &arguments).spawn().unwrap();
     let capture_in = |state: &str| {
         let status = finish(rig.command(&["status", "--once", "--json"]));
@@ -113,8 +118,7 @@ fn a_stream_of_damaged_pictures_is_a_state_with_its_reason() {
     };
     until("that it waits", || capture_in("stale"));
     let mut sender = UnixStream::connect(&socket).unwrap();
-    let mut sequence = 0;
-    let mut send = |is_damaged: bool| {
+    let mut send = |sequence: u64, is_damaged: bool| {
         let stamp_nanos = 1_000_000 * sequence as i64;
         let header = StreamHeader::gray((640, 480), StreamClock::Other, stamp_nanos, sequence);
         let mut header = header.to_bytes();
@@ -123,23 +127,34 @@ fn a_stream_of_damaged_pictures_is_a_state_with_its_reason() {
             header[16..20].fill(0);
             header[20..24].copy_from_slice(b"MJPG");
         }
-        sender.write_all(&header).unwrap();
-        sender.write_all(&vec![90; 640 * 480]).unwrap();
-        sequence += 1;
+        sender.write_all(&header).and_then(|()| sender.write_all(&vec![90; 640 * 480]))
     };
-    let found = until("the damage", || {
-        send(true);
-        let found = capture_in("stale")?;
-        found["cause"].as_str()?.starts_with("every frame is damaged: ").then_some(found)
+    let is_damaged = AtomicBool::new(true);
+    let found = std::thread::scope(|scope| {
+        let is_damaged = &is_damaged;
+        // Until capture ends.
+        scope.spawn(move || {
+            for sequence in 0..MAX_FRAMES {
+                if send(sequence, is_damaged.load(Ordering::Relaxed)).is_err() {
+                    break;
+                }
+                std::thread::sleep(PERIOD);
+            }
+        });
+        let found = until("the damage", || {
+            let found = capture_in("stale")?;
+            found["cause"].as_str()?.starts_with("every frame is damaged: ").then_some(found)
+        });
+        is_damaged.store(false, Ordering::Relaxed);
+        until("that it runs", || capture_in("running"));
+        signal(&child, Signal::INT);
+        found
     });
     assert!(found["refused"].as_u64() > Some(1), "{found}");
-    until("that it runs", || {
-        send(false);
-        capture_in("running")
-    });
-    signal(&child, Signal::INT);
     let ended = end(child);
-    assert_eq!(ended.stderr.matches("every frame is damaged").count(), 1, "{}", ended.stderr);
+    // Once, or again where the machine was busy for a second.
+    let told = ended.stderr.matches("every frame is damaged").count();
+    assert!((1..=3).contains(&told), "{}", ended.stderr);
 }
 
 #[test]
@@ -155,7 +170,7 @@ fn a_run_prints_once_that_it_waits_for_a_camera() {
         }
         assert!(lines.contains("waiting: there is no camera"), "{lines}");
         // Time for a second line to appear.
-        std::thread::sleep(std::time::Duration::from_millis(500));
+        std::thread::sleep(Duration::from_millis(500));
         signal(&child, Signal::INT);
         std::io::Read::read_to_string(&mut said, &mut lines).unwrap();
         assert_eq!(end(child).status.code(), Some(130), "{lines}");

@@ -46,6 +46,8 @@ struct Stream<D> {
     idle: Vec<usize>,
     since_nanos: i64,
     newest_nanos: i64,
+    /// Whether only damaged frames have arrived since.
+    is_damaged: bool,
     exposure: Exposure,
     exposure_nanos: i64,
     lock_is_due: bool,
@@ -204,6 +206,7 @@ impl<S: VideoSystem> Camera<S> {
             idle: Vec::with_capacity(num_buffers),
             since_nanos: now,
             newest_nanos: now,
+            is_damaged: false,
             exposure,
             exposure_nanos: now,
             lock_is_due: controls::has_locks(&self.params),
@@ -237,7 +240,7 @@ impl<S: VideoSystem> Camera<S> {
         if silent_nanos as f64 > self.params.stall_s * 1e9 {
             let path = stream.path.display();
             let seconds = self.params.stall_s;
-            let what = if self.refused_in_a_row > 0 { "only damaged frames" } else { "no frame" };
+            let what = if stream.is_damaged { "only damaged frames" } else { "no frame" };
             return Err(Absence::transient(format!(
                 "{path}: has delivered {what} for {seconds} s"
             )));
@@ -282,6 +285,7 @@ impl<S: VideoSystem> Camera<S> {
             };
             count += 1;
             let is_damaged = filled.flags & FLAG_ERROR != 0;
+            stream.is_damaged = is_damaged;
             if !is_damaged {
                 stream.newest_nanos = arrival_nanos;
             }

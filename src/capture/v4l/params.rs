@@ -123,8 +123,8 @@ pub struct CameraParams {
     /// Offset added to every stamp, microseconds, after it was moved to the middle of the exposure: the delay found by
     /// a calibration of the stamps, such as minus half the readout of a rolling shutter.
     pub stamp_offset_us: i64,
-    /// Seconds without an undamaged frame after which a camera is stale, and one that streams is reopened; longer than
-    /// the longest exposure.
+    /// Seconds without an undamaged frame after which a camera is stale; longer than the longest exposure. If its driver
+    /// delivers none, it is also reopened.
     pub stall_s: f64,
     /// Longest pause between two attempts to open a camera, seconds; the first is 0.1 and they double.
     pub retry_s: f64,

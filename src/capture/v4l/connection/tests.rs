@@ -235,6 +235,13 @@ fn a_camera_whose_frames_are_all_damaged_is_reopened() {
     assert_eq!(reason.as_deref(), Some("/dev/video0: has delivered only damaged frames for 2 s"));
     come_back(&mut camera);
     assert_eq!(fake.opened(), 2);
+    let mut reason = None;
+    while reason.is_none() {
+        if let Arrival::Absent(text) = camera.await_frame(None, 10).unwrap() {
+            reason = Some(text);
+        }
+    }
+    assert_eq!(reason.as_deref(), Some("/dev/video0: has delivered no frame for 2 s"));
 }
 
 #[test]
