@@ -94,15 +94,18 @@ impl MapSession {
             self.keeper = Some(keeper);
         }
         let can_continue = |left: &Map| left.keyframes.iter().any(|of| of.intrinsics == *camera);
-        if let Some(left) = left.filter(|left| self.map_use == MapUse::Extend && can_continue(left))
-        {
-            return Ok(mapper.resume(left.merged_over(map)));
+        let continues = self.map_use == MapUse::Extend && left.as_ref().is_some_and(can_continue);
+        match left {
+            Some(left) if continues => Ok(mapper.resume(left.merged_over(map))),
+            left => {
+                let folder = self.folder.clone();
+                mapper
+                    .start_in_map(map, self.map_use)
+                    .map_err(|source| MapSessionError::Prior { folder, source })?;
+                left.iter().for_each(|left| mapper.skip_numbers_after(left));
+                Ok(StepOutcome::default())
+            }
         }
-        let folder = self.folder.clone();
-        mapper
-            .start_in_map(map, self.map_use)
-            .map_err(|source| MapSessionError::Prior { folder, source })?;
-        Ok(StepOutcome::default())
     }
 
     /// Whether it is the map in `folder`; an empty path matches any map.

@@ -94,6 +94,17 @@ impl Mapper {
         self.resume_loops();
     }
 
+    /// Skips the numbers that mappers which died since the checkpoint `left` may have assigned, in this map or beyond
+    /// it. Call it before the first frame.
+    pub fn skip_numbers_after(&mut self, left: &Map) {
+        let (ids, revisions) = (left.free_keyframe_id(), left.free_revision());
+        let mappers = left.reservations();
+        self.next_keyframe_id =
+            self.next_keyframe_id.saturating_add(UNKNOWN_KEYFRAMES * mappers).max(ids);
+        self.revision = self.revision.saturating_add(UNKNOWN_REVISIONS * mappers).max(revisions);
+        self.first_free_epoch = self.first_free_epoch.saturating_add(left.free_epoch);
+    }
+
     /// Continues from a checkpoint: its keyframe becomes active again, the epoch and all ids continue. From a map that
     /// this camera cannot have made, only the numbers continue.
     pub fn resume(&mut self, map: Map) -> StepOutcome {
@@ -135,6 +146,7 @@ mod tests {
     use crate::slam::geometry::sim3::Sim3;
     use crate::slam::keyframe::DepthPoint;
     use crate::slam::mapper::MapperParams;
+    use crate::slam::mapper::prior::MapUse;
     use crate::slam::test_scene::CAMERA;
 
     fn mapper() -> Mapper {
@@ -178,6 +190,25 @@ mod tests {
         assert!(second.1 >= UNKNOWN_KEYFRAMES && second.2 >= UNKNOWN_REVISIONS, "{second:?}");
         assert!(third.1 - second.1 >= UNKNOWN_KEYFRAMES, "{second:?} {third:?}");
         assert!(third.2 - second.2 >= UNKNOWN_REVISIONS, "{second:?} {third:?}");
+    }
+
+    #[test]
+    fn mappers_that_die_in_a_map_on_disk_before_a_checkpoint_assign_different_numbers() {
+        let map = || Map { keyframes: vec![keyframe(2)], free_epoch: 7, ..Map::default() };
+        let mut left: Option<Map> = None;
+        let mut numbers = Vec::new();
+        for _ in 0..3 {
+            let mut mapper = mapper();
+            mapper.start_in_map(map(), MapUse::Extend).unwrap();
+            left.iter().for_each(|left| mapper.skip_numbers_after(left));
+            numbers.push([
+                mapper.next_keyframe_id / UNKNOWN_KEYFRAMES,
+                mapper.revision / UNKNOWN_REVISIONS,
+                u64::from((mapper.free_epoch() - 7) / UNKNOWN_EPOCHS),
+            ]);
+            left.get_or_insert_default().reserve_numbers();
+        }
+        assert_eq!(numbers, [[0, 0, 0], [1, 1, 1], [2, 2, 2]]);
     }
 
     #[test]
