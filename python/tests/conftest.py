@@ -18,6 +18,9 @@ SMALL_CAMERA = ("frames=60", "width=160", "height=120", "focal_px=131.0")
 WATCH_DOG_SECS = 120.0
 T = TypeVar("T")
 
+# A shell that starts the tests in the background has them ignore it, and so would the programs they start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 def binary() -> str:
     """The program: `SEMIDENSE_BIN`, else the last one built by cargo."""
