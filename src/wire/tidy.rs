@@ -17,8 +17,7 @@ use crate::wire::place::{
     CHECKPOINT_SUFFIX, CLAIM_SUFFIX, JOIN_LOCK, LOADED_MAP_SUFFIX, MEMBERS, POSITION_SUFFIX, Place,
     SUPERVISOR,
 };
-use crate::wire::root_folder::is_mine;
-use crate::wire::unfinished::OWNER_MAY_WRITE;
+use crate::wire::unfinished::{OWNER_MAY_WRITE, is_ours};
 
 /// Longest wait before tidying up; the next process that leaves can do it as well.
 const LONGEST_TIDY_WAIT: Duration = Duration::from_secs(1);
@@ -221,8 +220,7 @@ impl Kind {
 
 /// Whether this is the file about a node's process while it is being made: nobody may read it.
 fn is_unfinished(context: &Path) -> bool {
-    fs::symlink_metadata(context)
-        .is_ok_and(|found| is_mine(&found) && found.mode() & 0o777 == OWNER_MAY_WRITE)
+    is_ours(context, |found| found.mode() & 0o777 == OWNER_MAY_WRITE)
 }
 
 /// Whether a file was written so recently that a successor of its writer may still start. A stamp in the future counts

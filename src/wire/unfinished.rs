@@ -46,7 +46,7 @@ impl Place {
 }
 
 /// Whether a path is a file of this user in the given state.
-fn is_ours(path: &Path, is_in_state: impl Fn(&Metadata) -> bool) -> bool {
+pub(in crate::wire) fn is_ours(path: &Path, is_in_state: impl Fn(&Metadata) -> bool) -> bool {
     let found = fs::symlink_metadata(path);
     found.is_ok_and(|found| found.is_file() && is_mine(&found) && is_in_state(&found))
 }
