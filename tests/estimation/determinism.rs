@@ -1,9 +1,9 @@
 //! Bit-identical results for any number of threads, and for three processes as for one, on a sequence that
-//! initialises, tracks and changes keyframes.
+//! initialises, tracks and changes keyframes. It is rendered once a test: other tests check that its bytes do not
+//! depend on threads.
 
 use std::fs;
 use std::path::Path;
-use std::process::Command;
 
 use crate::support::{Rig, finish, small_camera};
 use serde_json::Value;
@@ -19,11 +19,21 @@ const SETTINGS: [&str; 4] = [
 const FILES: [&str; 5] =
     ["trajectory.txt", "trajectory_online.txt", "keyframes.txt", "map.ply", "points.ply"];
 
-/// Runs a command of the binary on the sequence and returns its summary.
-fn summary(mut command: Command, output: &Path) -> Value {
+/// Writes the sequence and returns its name as a source.
+fn recorded(rig: &Rig) -> String {
+    let folder = rig.folder().join("sequence");
+    let mut command = rig.command(&["simulate", "--output", folder.to_str().unwrap()]);
     for setting in SETTINGS {
         command.args(["--set", setting]);
     }
+    let ended = finish(command);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    format!("tum:{}", folder.display())
+}
+
+/// Runs a command of the binary and returns its summary.
+fn summary(rig: &Rig, arguments: &[&str], output: &Path) -> Value {
+    let mut command = rig.command(arguments);
     command.arg("--json").arg("--output").arg(output);
     let ended = finish(command);
     assert!(ended.status.success(), "{}", ended.stderr);
@@ -44,9 +54,10 @@ fn assert_same(one: &[Vec<u8>], other: &[Vec<u8>], what: &str) {
 #[test]
 fn threads_and_processes_do_not_change_a_bit() {
     let rig = Rig::new();
+    let sequence = recorded(&rig);
     let replayed = ["1", "2", "4"].map(|threads| {
         let output = rig.folder().join(threads);
-        let figures = summary(rig.command(&["replay", "sim", "--threads", threads]), &output);
+        let figures = summary(&rig, &["replay", &sequence, "--threads", threads], &output);
         // Equal files of a run that never tracked would prove nothing.
         assert!(figures["frames_tracked"].as_u64().unwrap() >= 45, "{figures}");
         // … nor would those of one whose keyframes were not estimated jointly.
@@ -57,7 +68,7 @@ fn threads_and_processes_do_not_change_a_bit() {
     assert_same(&replayed[0], &replayed[2], "1 and 4 threads");
 
     let output = rig.folder().join("processes");
-    summary(rig.command(&["run", "--set", "mapper.threads=2"]), &output);
+    summary(&rig, &["run", "--source", &sequence, "--set", "mapper.threads=2"], &output);
     assert_same(&replayed[0], &contents(&output), "one process and three in lockstep");
     assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
@@ -83,13 +94,14 @@ fn poses_that_a_run_keeps_only_in_its_journal_equal_those_of_a_replay() {
 #[test]
 fn no_depth_filter_depends_on_the_number_of_threads() {
     let rig = Rig::new();
+    let sequence = recorded(&rig);
     // "gaussian" is the default, which is compared above.
     for filter in ["interval", "both"] {
         let chosen = format!("mapping.depth_filter=\"{filter}\"");
         let replayed = ["1", "3"].map(|threads| {
             let output = rig.folder().join(format!("{filter}-{threads}"));
-            let arguments = ["replay", "sim", "--threads", threads, "--set", &chosen];
-            let figures = summary(rig.command(&arguments), &output);
+            let arguments = ["replay", &sequence, "--threads", threads, "--set", &chosen];
+            let figures = summary(&rig, &arguments, &output);
             assert!(figures["frames_tracked"].as_u64().unwrap() >= 45, "{filter}: {figures}");
             assert!(figures["keyframes"].as_u64().unwrap() >= 2, "{filter}: {figures}");
             contents(&output)
@@ -101,9 +113,10 @@ fn no_depth_filter_depends_on_the_number_of_threads() {
 #[test]
 fn results_of_either_filter_and_of_passes_do_not_depend_on_the_number_of_threads() {
     let rig = Rig::new();
+    let sequence = recorded(&rig);
     let of = |threads: &str, source: &str, every: &str| {
         let output = rig.folder().join(format!("{threads}-{source}-{every}"));
-        let mut arguments = vec!["replay", "sim", "--threads", threads];
+        let mut arguments = vec!["replay", &sequence, "--threads", threads];
         let source = format!("mapping.window.points_from=\"{source}\"");
         let every = format!("mapping.window.pass_every={every}");
         // A short sequence has few keyframes: a pass begins with the third.
@@ -111,7 +124,7 @@ fn results_of_either_filter_and_of_passes_do_not_depend_on_the_number_of_threads
         for chosen in [&source, &every].map(String::as_str).into_iter().chain(few) {
             arguments.extend(["--set", chosen]);
         }
-        let figures = summary(rig.command(&arguments), &output);
+        let figures = summary(&rig, &arguments, &output);
         let estimates = figures["adjustments"].as_u64().unwrap();
         assert!(estimates >= 3, "points from {source}, {every}: {figures}");
         (contents(&output), estimates)
