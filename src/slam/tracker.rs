@@ -134,6 +134,8 @@ pub struct Memory {
     newest_keyframe_id: u64,
     /// Whether the previous frame was not tracked on a keyframe.
     was_lost: bool,
+    /// The last frame with a pose, or at which the mapper switched to another keyframe.
+    known_sequence: Option<u64>,
     /// Covariance of the last estimate.
     covariance: [f64; 21],
     /// Unit of its translations, in world units.
@@ -200,6 +202,7 @@ impl Tracker {
             } else {
                 self.memory.brightness = Brightness::default();
                 self.memory.coarse_fit = None;
+                self.memory.known_sequence = self.memory.last_sequence;
             }
         }
         before
@@ -278,6 +281,9 @@ impl Tracker {
         );
         if self.memory.was_lost {
             self.memory.velocity.forget();
+        }
+        if estimate.state.is_tracked() {
+            self.memory.known_sequence = Some(frame.sequence);
         }
         self.memory.covariance = estimate.covariance;
         self.memory.unit = reference.world_from_keyframe().scale;
@@ -478,6 +484,8 @@ impl Tracker {
 
 #[cfg(test)]
 mod arbitrary_input_tests;
+#[cfg(test)]
+mod astray_tests;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]

@@ -52,6 +52,21 @@ fn sideways(x: f64) -> SE3 {
 }
 
 #[test]
+fn a_view_that_does_not_resemble_its_keyframe_is_not_accepted() {
+    let mut mapper = mapper_with(&[0.0]);
+    mapper.finder.index_new(&mut mapper.map.keyframes, 1);
+    let mut accepts = |pixels: &[u8]| {
+        let lost = PoseEstimate::unknown(&FrameView::new(&CAMERA, 5, 0, pixels));
+        mapper.accepted(Some((0, SE3::identity())), &lost, pixels).is_some()
+    };
+    let view = Scene::new(3).render(&CAMERA, &SE3::identity()).noisy(2.0, 9);
+    assert!(accepts(&view));
+    // In a map of one keyframe nothing else would refuse it.
+    let negative: Vec<u8> = view.iter().map(|grey| 255 - grey).collect();
+    assert!(!accepts(&negative));
+}
+
+#[test]
 fn a_pose_is_accepted_where_another_keyframe_confirms_it() {
     let pixels = Scene::new(3).render(&CAMERA, &sideways(0.1)).noisy(2.0, 9);
     let mut mapper = mapper_with(&[0.0, 0.15]);
