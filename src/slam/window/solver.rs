@@ -75,7 +75,7 @@ impl Solver {
                 (damping, failures) = ((damping * DAMPING_DOWN).max(MIN_DAMPING), 0);
                 // The linear model may predict more than kinks between pixels allow.
                 let is_flat = cost - moved < converged;
-                cost = moved;
+                cost = moved + self.system.entered_cost;
                 if is_flat {
                     break;
                 }

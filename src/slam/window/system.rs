@@ -45,6 +45,9 @@ pub struct System {
     pub compared: usize,
     /// Sum of the costs of the inliers.
     pub inlier_cost: f64,
+    /// Cost of the comparisons that were outside the image at the state before: left out of the comparison with it, but
+    /// not of that with the next.
+    pub entered_cost: f64,
 }
 
 /// Points that are eliminated at a time: their rows stay in the second-level cache.
@@ -171,7 +174,8 @@ impl System {
         self.mixed.resize(views.slots.len(), [0.0; PADDED]);
         self.costs.clear();
         self.costs.resize(views.slots.len(), f32::NAN);
-        (self.inliers, self.compared, self.inlier_cost) = (0, 0, 0.0);
+        (self.inliers, self.compared) = (0, 0);
+        (self.inlier_cost, self.entered_cost) = (0.0, 0.0);
     }
 
     /// Stores the results of a pair's comparisons and returns the part of their cost that is comparable with the state
@@ -202,7 +206,9 @@ impl System {
                 self.compared += usize::from(!found.is_nan());
                 self.inliers += usize::from(is_same);
                 self.inlier_cost += f64::from(if is_same { found } else { 0.0 });
-                totals[lane] += f64::from(if is_new || cost.is_nan() { 0.0 } else { cost });
+                let cost = f64::from(if cost.is_nan() { 0.0 } else { cost });
+                totals[lane] += if is_new { 0.0 } else { cost };
+                self.entered_cost += if is_new { cost } else { 0.0 };
             }
             for (lane, &slot) in views.slots[places.clone()].iter().enumerate() {
                 self.points[slot].add(seen, lane, wanted);

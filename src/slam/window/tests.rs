@@ -302,6 +302,35 @@ fn a_similarity_of_the_initial_state_gives_the_same_window() {
 }
 
 #[test]
+fn costs_that_are_compared_are_sums_over_the_same_comparisons() {
+    let truth = room(|_, _| (1.0, 0.0));
+    let members: Vec<usize> = (0..truth.keyframes.len()).collect();
+    let free = [None, Some(0), Some(1), Some(2)];
+    let members = Members { members: &members, free: &free, depths_are_free: true };
+    let robustness = Robustness { huber_grey: 9.0, most_energy: 8.0 * 144.0 };
+    let at = Level { camera: &CAMERA, level: 0, robustness };
+    let mut views = view::Views::default();
+    views.find(&truth.keyframes, members.members, &CAMERA, |_, _| true);
+    views.sample_patterns(&truth.keyframes, members.members, 0);
+    views.fetch_depths(&truth.keyframes, members.members);
+    // Nearer to the wall, where the border of its image cuts off some of the points.
+    let mut near = truth.clone();
+    let forwards = SE3 { translation: [0.0, 0.0, -0.1].into(), ..SE3::identity() };
+    near.keyframes[3].camera_from_map = forwards * near.keyframes[3].camera_from_map;
+    let cost_of = |room: &Room, before: Option<&system::System>| {
+        let mut system = system::System::default();
+        let cost = system.linearise(&room.keyframes, &members, &views, &at, before);
+        (cost, system)
+    };
+    let (_, before) = cost_of(&near, None);
+    let (comparable, moved) = cost_of(&truth, Some(&before));
+    let (all, _) = cost_of(&truth, None);
+    assert!(comparable < 0.999 * all, "nothing has entered: {comparable} of {all}");
+    let next = comparable + moved.entered_cost;
+    assert!((next - all).abs() < 1e-6 * all, "{next} {all}");
+}
+
+#[test]
 fn the_unit_is_kept_where_one_keyframe_holds_it() {
     let truth = room(|_, _| (1.0, 0.0));
     let members: Vec<usize> = (0..truth.keyframes.len()).collect();
