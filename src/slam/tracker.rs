@@ -134,8 +134,9 @@ pub struct Memory {
     newest_keyframe_id: u64,
     /// Whether the previous frame was not tracked on a keyframe.
     was_lost: bool,
-    /// The last frame with a pose, or at which the mapper switched to another keyframe.
-    known_sequence: Option<u64>,
+    /// Stamp of the last frame with a pose, or of the first one since the mapper switched to another keyframe; `None`
+    /// until that frame.
+    known_nanos: Option<i64>,
     /// Covariance of the last estimate.
     covariance: [f64; 21],
     /// Unit of its translations, in world units.
@@ -202,7 +203,7 @@ impl Tracker {
             } else {
                 self.memory.brightness = Brightness::default();
                 self.memory.coarse_fit = None;
-                self.memory.known_sequence = self.memory.last_sequence;
+                self.memory.known_nanos = None;
             }
         }
         before
@@ -214,6 +215,7 @@ impl Tracker {
         self.memory.motion.observe(nanos, world_from_camera);
         self.memory.velocity.forget();
         self.memory.was_lost = true;
+        self.memory.known_nanos = Some(nanos);
     }
 
     /// Starts on another tracker's map, without a pose of the camera: a pose must fit as well as after a loss, or any
@@ -249,6 +251,7 @@ impl Tracker {
         self.prepare_next();
         let before = self.memory.clone();
         let missing = self.count_missing(frame.sequence);
+        self.memory.known_nanos.get_or_insert(frame.capture_nanos);
         let Some(reference) = self.reference.take() else {
             return self.unclaimed(frame, None, TrackingState::Initializing);
         };
@@ -283,7 +286,7 @@ impl Tracker {
             self.memory.velocity.forget();
         }
         if estimate.state.is_tracked() {
-            self.memory.known_sequence = Some(frame.sequence);
+            self.memory.known_nanos = Some(frame.capture_nanos);
         }
         self.memory.covariance = estimate.covariance;
         self.memory.unit = reference.world_from_keyframe().scale;

@@ -28,9 +28,9 @@ const MIN_SIMILARITY: f32 = 0.3;
 /// Features that an image and a keyframe must share to be aligned: other places share up to twelve; alignment decides.
 const MIN_SHARED: f32 = 8.0;
 
-/// Correlation of small images, or features shared, either of which a place that is found must have.
-const SURE_SIMILARITY: f32 = 0.5;
-const SURE_SHARED: f32 = 10.0;
+/// Correlation of small images, or features shared, either of which a place needs that was found.
+const FOUND_SIMILARITY: f32 = 0.5;
+const FOUND_SHARED: f32 = 10.0;
 
 /// Newest keyframes whose small images are compared: 12 µs each. The index holds all keyframes.
 const MAX_COMPARED: usize = 300;
@@ -305,14 +305,14 @@ impl Finder {
     pub(super) fn resembles(&mut self, keyframe: &Keyframe, pixels: &[u8]) -> bool {
         let Intrinsics { width, height, .. } = self.camera;
         let is_alike = |seen: Appearance| {
-            self.appearance(keyframe).is_some_and(|of| of.similarity(&seen) >= SURE_SIMILARITY)
+            self.appearance(keyframe).is_some_and(|of| of.similarity(&seen) >= FOUND_SIMILARITY)
         };
         if Appearance::of(pixels, width, height).is_some_and(is_alike) {
             return true;
         }
         let Some(seen) = self.describer.describe(pixels, width, height) else { return false };
         let found = self.places.candidates(&seen, 1, |id| id != keyframe.keyframe_id);
-        found.first().is_some_and(|place| place.score >= SURE_SHARED)
+        found.first().is_some_and(|place| place.score >= FOUND_SHARED)
     }
 
     /// Aligns a frame to `keyframe` from the expected pose; `None` where it does not fit, or ends further from that

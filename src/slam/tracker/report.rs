@@ -61,7 +61,8 @@ impl Tracker {
         if let TrackingState::Lost(reason) = verdict {
             return self.lost(frame, reference, reason, quality);
         }
-        if self.is_astray(frame.sequence) && quality.inlier_ratio < self.least_inliers_alone() {
+        let is_doubtful = quality.inlier_ratio < self.least_inliers_astray();
+        if is_doubtful && self.is_astray(reference, nanos, world_from_camera) {
             return self.lost(frame, reference, LostReason::TooFewInliers, quality);
         }
         let covariance = alignment.covariance(&self.params.alignment);
@@ -74,22 +75,33 @@ impl Tracker {
         self.claim(reference, alignment, &placed, &covariance, PoseEstimate { quality, ..estimate })
     }
 
-    /// Whether the camera has been lost for so long that it may be anywhere, and nobody but the tracker finds it.
-    fn is_astray(&self, sequence: u64) -> bool {
-        /// Frames within which it is where it was, or where the mapper found it.
-        const MAX_FRAMES: u64 = 5;
-        let known = self.memory.known_sequence;
-        self.memory.was_lost
-            && known.is_some_and(|known| sequence.saturating_sub(known) > MAX_FRAMES)
+    /// Whether the camera was lost for so long that it may be anywhere, and this is not where it was: the mapper has not
+    /// found it there, and no second keyframe confirms it.
+    fn is_astray(&self, reference: &Reference, nanos: i64, world_from_camera: &SE3) -> bool {
+        /// Time by the stamps within which it is near where it was, or where the mapper found it.
+        const MAX_NANOS: i64 = 200_000_000;
+        /// Largest distance from there of a camera that stood still, mean depths plus radians.
+        const MAX_DISTANCE: f64 = 0.1;
+        let known = self.memory.known_nanos.unwrap_or(nanos);
+        if !self.memory.was_lost || nanos.saturating_sub(known) <= MAX_NANOS {
+            return false;
+        }
+        let mean_depth = reference.world_from_keyframe().scale / reference.mean_inverse_depth();
+        let is_there = |last: SE3| {
+            let off = last.inverse() * *world_from_camera;
+            off.translation.norm() / mean_depth + off.rotation.angle() <= MAX_DISTANCE
+        };
+        !self.memory.motion.last().is_some_and(is_there)
     }
 
-    /// Least share of inliers for such a camera to be found: no second keyframe confirms it. On redkitchen with
-    /// blackouts two wrong places had 0.80 and 0.81, fourteen right ones 0.90 and more.
-    fn least_inliers_alone(&self) -> f64 {
-        /// Beyond what a camera needs that the mapper has found.
-        const MARGIN: f64 = 0.07;
+    /// Least share of inliers of such a pose. On redkitchen with blackouts two wrong ones had 0.80 and 0.81, fourteen
+    /// right ones 0.90 and more.
+    fn least_inliers_astray(&self) -> f64 {
+        /// Share of the way from what a lost camera needs to all points: 0.87 by default.
+        const FURTHER: f64 = 0.35;
         let verdict = &self.params.verdict;
-        verdict.lost_inliers + verdict.recovery_margin + MARGIN
+        let least = (verdict.lost_inliers + verdict.recovery_margin).min(1.0);
+        least + FURTHER * (1.0 - least)
     }
 
     /// An estimate with its pose and the covariance of that: `covariance` is that of the alignment, to which the common
