@@ -334,6 +334,11 @@ impl Reference {
         self.mean_inverse_depth
     }
 
+    /// The same as a depth, in world units.
+    pub fn mean_depth_in_world(&self) -> f64 {
+        self.world_from_keyframe().scale / self.mean_inverse_depth()
+    }
+
     /// Covariance of the errors that all depth of the keyframe shares.
     pub fn mode_covariance(&self) -> &ModeCovariance {
         &self.mode_covariance

@@ -86,7 +86,7 @@ impl Tracker {
         if !self.memory.was_lost || nanos.saturating_sub(known) <= MAX_NANOS {
             return false;
         }
-        let mean_depth = reference.world_from_keyframe().scale / reference.mean_inverse_depth();
+        let mean_depth = reference.mean_depth_in_world();
         let is_there = |last: SE3| {
             let off = last.inverse() * *world_from_camera;
             off.translation.norm() / mean_depth + off.rotation.angle() <= MAX_DISTANCE
@@ -196,7 +196,7 @@ impl Tracker {
             return false;
         };
         let off = predicted.inverse() * *world_from_camera;
-        let mean_depth = reference.world_from_keyframe().scale / reference.mean_inverse_depth();
+        let mean_depth = reference.mean_depth_in_world();
         let most =
             |least: f64, of_step: f64| (least * intervals).max(MAX_STEP_CHANGE_RATIO * of_step);
         off.rotation.angle() > most(MAX_ROTATION_RAD, step.rotation.angle())

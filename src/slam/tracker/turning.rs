@@ -228,7 +228,7 @@ impl Tracker {
         before: &Memory,
         budget: &mut dyn FnMut(usize) -> bool,
     ) -> Option<PoseEstimate> {
-        let unit = reference.world_from_keyframe().scale / reference.mean_inverse_depth();
+        let unit = reference.mean_depth_in_world();
         if self.turning.place.is_none() {
             self.begin_turning(before, unit);
         }
