@@ -6,6 +6,7 @@ mod report;
 mod turning;
 pub(crate) mod velocity;
 pub mod verdict;
+mod whereabouts;
 
 use serde::{Deserialize, Serialize};
 
@@ -27,6 +28,7 @@ use crate::slam::tracker::motion::{Motion, hypotheses, rotations_around};
 use crate::slam::tracker::turning::{Turning, may_turn};
 use crate::slam::tracker::velocity::VelocityMemory;
 use crate::slam::tracker::verdict::{VerdictParams, fits_better, is_better, quality_of};
+use crate::slam::tracker::whereabouts::Whereabouts;
 
 /// Standard deviations by which a pose may differ from the held one: one of a hundred correct finds is refused.
 pub const MAX_POSE_DEVIATIONS: f64 = 3.0;
@@ -134,9 +136,7 @@ pub struct Memory {
     newest_keyframe_id: u64,
     /// Whether the previous frame was not tracked on a keyframe.
     was_lost: bool,
-    /// Stamp of the last frame with a pose, or of the first one since the mapper switched to another keyframe; `None`
-    /// until that frame.
-    known_nanos: Option<i64>,
+    whereabouts: Whereabouts,
     /// Covariance of the last estimate.
     covariance: [f64; 21],
     /// Unit of its translations, in world units.
@@ -178,9 +178,22 @@ impl Tracker {
     pub fn adopt(&mut self, reference: Box<Reference>) -> Option<Box<Reference>> {
         /// Frames by which a mapper may lag with the first keyframe of an epoch: ten seconds at 30 Hz.
         const MAX_FRAMES_BEHIND: u64 = 300;
+        let behind =
+            self.memory.last_sequence.and_then(|last| last.checked_sub(reference.sequence()));
+        let is_recent = behind.is_some_and(|behind| behind <= MAX_FRAMES_BEHIND);
         let before = self.reference.replace(reference);
         let (old, new) = (before.as_deref(), self.reference.as_deref());
         if let (Some(old), Some(new)) = (old, new) {
+            if old.keyframe_id() == new.keyframe_id() {
+                let (before, after) = (old.world_from_keyframe(), new.world_from_keyframe());
+                self.memory.motion.follow(before, after);
+                self.memory.velocity.follow(after.scale / before.scale);
+                self.turning.follow(before, after);
+            } else {
+                self.memory.brightness = Brightness::default();
+                self.memory.coarse_fit = None;
+                self.memory.whereabouts = Whereabouts::FromNextFrame;
+            }
             // A keyframe whose epoch was joined to another has a new epoch number but the same pose, and an epoch that
             // is resumed is placed where the odometry has the camera.
             let newest = self.memory.newest_keyframe_id.max(old.keyframe_id());
@@ -190,21 +203,13 @@ impl Tracker {
                 self.memory.velocity.forget();
                 // On a keyframe that was not created just now, but belongs to a map that the mapper switched to, the
                 // camera may be anywhere.
-                let age =
-                    self.memory.last_sequence.and_then(|last| last.checked_sub(new.sequence()));
-                self.memory.was_lost = age.is_none_or(|age| age > MAX_FRAMES_BEHIND);
+                self.memory.was_lost = !is_recent;
+                self.memory.whereabouts = Whereabouts::on_first_keyframe(is_recent);
                 self.turning.end();
             }
-            if old.keyframe_id() == new.keyframe_id() {
-                let (before, after) = (old.world_from_keyframe(), new.world_from_keyframe());
-                self.memory.motion.follow(before, after);
-                self.memory.velocity.follow(after.scale / before.scale);
-                self.turning.follow(before, after);
-            } else {
-                self.memory.brightness = Brightness::default();
-                self.memory.coarse_fit = None;
-                self.memory.known_nanos = None;
-            }
+        } else if let Some(new) = new {
+            let is_new = is_recent && !Self::is_found_on(new.keyframe_id());
+            self.memory.whereabouts = Whereabouts::on_first_keyframe(is_new);
         }
         before
     }
@@ -215,7 +220,7 @@ impl Tracker {
         self.memory.motion.observe(nanos, world_from_camera);
         self.memory.velocity.forget();
         self.memory.was_lost = true;
-        self.memory.known_nanos = Some(nanos);
+        self.memory.whereabouts = Whereabouts::known_at(nanos);
     }
 
     /// Starts on another tracker's map, without a pose of the camera: a pose must fit as well as after a loss, or any
@@ -251,10 +256,10 @@ impl Tracker {
         self.prepare_next();
         let before = self.memory.clone();
         let missing = self.count_missing(frame.sequence);
-        self.memory.known_nanos.get_or_insert(frame.capture_nanos);
         let Some(reference) = self.reference.take() else {
             return self.unclaimed(frame, None, TrackingState::Initializing);
         };
+        self.memory.whereabouts.observe(frame.capture_nanos);
         let estimate = match self.refusal(&reference, frame) {
             Some(reason) => {
                 self.turning.end();
@@ -286,7 +291,7 @@ impl Tracker {
             self.memory.velocity.forget();
         }
         if estimate.state.is_tracked() {
-            self.memory.known_nanos = Some(frame.capture_nanos);
+            self.memory.whereabouts = Whereabouts::known_at(frame.capture_nanos);
         }
         self.memory.covariance = estimate.covariance;
         self.memory.unit = reference.world_from_keyframe().scale;

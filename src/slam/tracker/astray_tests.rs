@@ -10,17 +10,30 @@ use crate::slam::keyframe::Keyframe;
 use crate::slam::pose::{LostReason, PoseEstimate, TrackingState};
 use crate::slam::tracker::{Tracker, TrackerParams};
 
-/// The camera is tracked up to `away` (0: at its keyframe, 12: a quarter of the mean depth away) and returns to the
-/// keyframe after `lost` frames, where two ninths of the view now show something else; the mapper switches to another
-/// keyframe before that or not.
-fn returned(away: u64, lost: u64, is_sought: bool) -> PoseEstimate {
+/// Time between two frames of a usual and of a slow camera, nanoseconds.
+const USUAL: i64 = 33_333_333;
+const SLOW: i64 = 333_333_333;
+
+/// The view of `keyframe`, of which two ninths now show something else.
+fn changed_view(keyframe: &Keyframe) -> Vec<u8> {
+    let mut noise = Noise(5);
+    let mut image = keyframe.image.to_vec();
+    let changed = keyframe.intrinsics.width * (keyframe.intrinsics.height * 7 / 9);
+    image[changed..].fill_with(|| (128.0 + 100.0 * noise.uniform()) as u8);
+    image
+}
+
+/// A camera is tracked up to `away` (0: at its keyframe, 12: a quarter of the mean depth away) and returns to the
+/// keyframe after `lost` frames, where it sees its changed view; the mapper switches to another keyframe before that or
+/// not.
+fn returned(interval_nanos: i64, away: u64, lost: u64, is_sought: bool) -> PoseEstimate {
     let (plane, camera) = (small_plane(), small_camera());
     let keyframe = Keyframe { keyframe_id: 7, ..plane.keyframe(&camera, 2, 0.02) };
     let mut tracker = Tracker::new(camera, TrackerParams::default()).unwrap();
     tracker.adopt(Box::new(Reference::prepare(&keyframe)));
     let mut sequence = 0;
     let mut track = |tracker: &mut Tracker, pixels: &[u8]| {
-        let nanos = sequence as i64 * 33_333_333;
+        let nanos = sequence as i64 * interval_nanos;
         sequence += 1;
         tracker.track(&FrameView::new(&camera, sequence, nanos, pixels), &mut |_| true)
     };
@@ -39,23 +52,52 @@ fn returned(away: u64, lost: u64, is_sought: bool) -> PoseEstimate {
         let found = Keyframe { keyframe_id: 3, ..keyframe.clone() };
         tracker.adopt(Box::new(Reference::prepare(&found)));
     }
-    let mut noise = Noise(5);
-    let mut image = keyframe.image.to_vec();
-    let changed = camera.width * (camera.height * 7 / 9);
-    image[changed..].fill_with(|| (128.0 + 100.0 * noise.uniform()) as u8);
-    track(&mut tracker, &image)
+    track(&mut tracker, &changed_view(&keyframe))
 }
 
 #[test]
 fn away_from_where_it_was_a_camera_lost_for_long_must_be_surer_without_the_mapper() {
-    let soon = returned(12, 3, false);
+    let soon = returned(USUAL, 12, 3, false);
     let inliers = soon.quality.inlier_ratio;
     assert!((0.81..0.86).contains(&inliers), "{inliers}: the test needs an image in between");
     assert!(soon.state.is_tracked(), "{:?}", soon.state);
-    let late = returned(12, 20, false);
-    assert_eq!(late.state, TrackingState::Lost(LostReason::TooFewInliers));
+    for interval in [USUAL, SLOW] {
+        let late = returned(interval, 12, 20, false);
+        assert_eq!(late.state, TrackingState::Lost(LostReason::TooFewInliers));
+    }
     for (away, is_sought) in [(12, true), (0, false)] {
-        let found = returned(away, 20, is_sought);
+        let found = returned(USUAL, away, 20, is_sought);
         assert!(found.state.is_tracked(), "{away}, {is_sought}: {:?}", found.state);
     }
+}
+
+#[test]
+fn a_few_frames_of_a_slow_camera_are_not_long() {
+    let soon = returned(SLOW, 12, 3, false);
+    assert!(soon.state.is_tracked(), "{:?}", soon.state);
+}
+
+#[test]
+fn before_its_first_pose_a_camera_is_near_the_keyframe_of_a_new_map() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let mut tracker = Tracker::new(camera, TrackerParams::default()).unwrap();
+    let mut sequence = 0;
+    let mut track = |tracker: &mut Tracker, pixels: &[u8]| {
+        let nanos = sequence as i64 * USUAL;
+        sequence += 1;
+        tracker.track(&FrameView::new(&camera, sequence, nanos, pixels), &mut |_| true).state
+    };
+    let created = Keyframe { keyframe_id: 0, sequence: 1, ..plane.keyframe(&camera, 2, 0.02) };
+    let black = vec![0; created.image.len()];
+    for _ in 0..20 {
+        assert_eq!(track(&mut tracker, &black), TrackingState::Initializing);
+    }
+    tracker.adopt(Box::new(Reference::prepare(&created)));
+    tracker.begin_lost();
+    for _ in 0..20 {
+        let state = track(&mut tracker, &black);
+        assert!(matches!(state, TrackingState::Lost(_)), "{state:?}");
+    }
+    let state = track(&mut tracker, &changed_view(&created));
+    assert!(state.is_tracked(), "{state:?}");
 }

@@ -78,12 +78,9 @@ impl Tracker {
     /// Whether the camera was lost for so long that it may be anywhere, and this is not where it was: the mapper has not
     /// found it there, and no second keyframe confirms it.
     fn is_astray(&self, reference: &Reference, nanos: i64, world_from_camera: &SE3) -> bool {
-        /// Time by the stamps within which it is near where it was, or where the mapper found it.
-        const MAX_NANOS: i64 = 200_000_000;
         /// Largest distance from there of a camera that stood still, mean depths plus radians.
         const MAX_DISTANCE: f64 = 0.1;
-        let known = self.memory.known_nanos.unwrap_or(nanos);
-        if !self.memory.was_lost || nanos.saturating_sub(known) <= MAX_NANOS {
+        if !self.memory.was_lost || !self.memory.whereabouts.is_unknown(nanos) {
             return false;
         }
         let mean_depth = reference.mean_depth_in_world();
