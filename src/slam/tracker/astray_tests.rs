@@ -77,8 +77,9 @@ fn a_few_frames_of_a_slow_camera_are_not_long() {
     assert!(soon.state.is_tracked(), "{:?}", soon.state);
 }
 
-#[test]
-fn before_its_first_pose_a_camera_is_near_the_keyframe_of_a_new_map() {
+/// A camera is lost for 20 frames on a keyframe of `keyframe_id`, the first one at all or that of a later epoch, before it
+/// has a pose on it and sees its changed view.
+fn first_pose(keyframe_id: u64, is_later_epoch: bool) -> TrackingState {
     let (plane, camera) = (small_plane(), small_camera());
     let mut tracker = Tracker::new(camera, TrackerParams::default()).unwrap();
     let mut sequence = 0;
@@ -87,17 +88,36 @@ fn before_its_first_pose_a_camera_is_near_the_keyframe_of_a_new_map() {
         sequence += 1;
         tracker.track(&FrameView::new(&camera, sequence, nanos, pixels), &mut |_| true).state
     };
-    let created = Keyframe { keyframe_id: 0, sequence: 1, ..plane.keyframe(&camera, 2, 0.02) };
-    let black = vec![0; created.image.len()];
-    for _ in 0..20 {
-        assert_eq!(track(&mut tracker, &black), TrackingState::Initializing);
+    let initial = Keyframe { keyframe_id: 0, sequence: 1, ..plane.keyframe(&camera, 2, 0.02) };
+    if is_later_epoch {
+        tracker.adopt(Box::new(Reference::prepare(&initial)));
     }
-    tracker.adopt(Box::new(Reference::prepare(&created)));
-    tracker.begin_lost();
+    let black = vec![0; initial.image.len()];
+    for _ in 0..20 {
+        assert!(!track(&mut tracker, &black).is_tracked());
+    }
+    let epoch = initial.epoch + u32::from(is_later_epoch);
+    let keyframe = Keyframe { keyframe_id, epoch, ..initial };
+    tracker.adopt(Box::new(Reference::prepare(&keyframe)));
+    if !is_later_epoch {
+        tracker.begin_lost();
+    }
     for _ in 0..20 {
         let state = track(&mut tracker, &black);
         assert!(matches!(state, TrackingState::Lost(_)), "{state:?}");
     }
-    let state = track(&mut tracker, &changed_view(&created));
-    assert!(state.is_tracked(), "{state:?}");
+    track(&mut tracker, &changed_view(&keyframe))
+}
+
+#[test]
+fn before_its_first_pose_a_camera_is_near_the_keyframe_of_a_new_map() {
+    for (keyframe_id, is_later_epoch) in [(0, false), (5, true)] {
+        let state = first_pose(keyframe_id, is_later_epoch);
+        assert!(state.is_tracked(), "{keyframe_id}, {is_later_epoch}: {state:?}");
+    }
+}
+
+#[test]
+fn on_the_map_of_another_tracker_a_camera_may_be_anywhere() {
+    assert_eq!(first_pose(5, false), TrackingState::Lost(LostReason::TooFewInliers));
 }
