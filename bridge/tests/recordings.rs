@@ -53,13 +53,16 @@ fn run_python(name: &str, argument: &Path) -> Option<String> {
     Some(succeed(command))
 }
 
+/// A frame of a bag and its pixels.
+type Frame = (FrameStamp, Vec<u8>);
+
 /// Every frame of a bag.
-fn play(path: &Path) -> Vec<(FrameStamp, Vec<u8>)> {
+fn play(path: &Path) -> Vec<Frame> {
     try_to_play(path).unwrap()
 }
 
 /// Every frame of a bag, unless it cannot be read, or not yet.
-fn try_to_play(path: &Path) -> Result<Vec<(FrameStamp, Vec<u8>)>, Box<dyn Error>> {
+fn try_to_play(path: &Path) -> Result<Vec<Frame>, Box<dyn Error>> {
     let name = SourceName::Mcap { file: path.to_owned(), topic: None };
     let mut source = open(&name, None, &SourceParams::default())?;
     let k = source.intrinsics();
