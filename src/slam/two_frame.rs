@@ -205,6 +205,14 @@ impl TwoFrameInitializer {
         true
     }
 
+    /// Whether `pixels` repeat the latest frame of a start, bit for bit.
+    pub(crate) fn is_latest(&self, pixels: &[u8]) -> bool {
+        let latest = self.pyramid.levels().first().map_or(&[][..], |level| level.pixels());
+        !self.first_pixels.is_empty()
+            && latest.len() == pixels.len()
+            && latest.iter().zip(pixels).all(|(latest, &grey)| *latest == f32::from(grey))
+    }
+
     /// Takes the next frame: fits, judges, and restarts where it must.
     pub fn step(&mut self, pixels: &[u8]) -> InitOutcome {
         if pixels.len() != self.intrinsics[0].width * self.intrinsics[0].height {

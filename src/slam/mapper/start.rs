@@ -72,13 +72,19 @@ impl Start {
     }
 
     /// Takes a frame; returns the start once parallax is proven. Some frames of a fast camera are left out: a start is
-    /// judged in steps of about 30 Hz, and must be proven within a fixed number of them.
+    /// judged in steps of about 30 Hz, and must be proven within a fixed number of them. So is a frame that repeats the
+    /// previous image, as in a video converted to a higher rate: it would confirm a motion that a single image shows, and
+    /// the camera would seem to have rested before the next one.
     fn step(&mut self, frame: &FrameView<'_>) -> Option<Proven> {
         /// A frame this soon after the previous one is left out, nanoseconds: 45 Hz.
         const TOO_SOON: std::ops::Range<i64> = 1..22_000_000;
         let since = self.latest.map(|(_, nanos)| frame.capture_nanos.saturating_sub(nanos));
         if since.is_some_and(|since| TOO_SOON.contains(&since)) {
             self.last_frame = None;
+            return None;
+        }
+        if self.initializer.as_ref().is_some_and(|start| start.is_latest(frame.pixels)) {
+            self.last_frame = Some(StartFrame::Still);
             return None;
         }
         let mut initializer = match self.initializer.take() {
@@ -350,15 +356,31 @@ mod tests {
 
     /// A start with a camera that moves forwards by 0.2 per frame, and the frame that proves it.
     fn proven(params: &TwoFrameParams) -> (Proven, Vec<u8>) {
+        proven_with(params, 1)
+    }
+
+    /// The same with each image sent `times` times.
+    fn proven_with(params: &TwoFrameParams, times: u64) -> (Proven, Vec<u8>) {
         let mut start = Start::new(CAMERA, params).unwrap();
-        let proven = (0..3).find_map(|frame| {
+        let proven = (0..3 * times).find_map(|sent| {
+            let frame = sent / times;
             let moved = Vector6::new(0.0, 0.0, 0.2 * frame as f64, 0.0, 0.0, 0.0);
             let pixels = Scene::new(1).render(&CAMERA, &SE3::exp(&moved)).noisy(2.0, 100 + frame);
-            let nanos = PERIOD_NANOS * frame as i64;
-            let proven = start.step(&FrameView::new(&CAMERA, 10 + frame, nanos, &pixels))?;
-            Some((proven, pixels))
+            let nanos = PERIOD_NANOS * sent as i64;
+            let proven = start.step(&FrameView::new(&CAMERA, 10 + sent, nanos, &pixels));
+            assert!(sent % times == 0 || start.last_frame == Some(StartFrame::Still));
+            Some((proven?, pixels))
         });
         proven.unwrap()
+    }
+
+    #[test]
+    fn an_image_that_is_repeated_counts_once() {
+        let (once, pixels) = proven(&TwoFrameParams::default());
+        let (repeated, last) = proven_with(&TwoFrameParams::default(), 2);
+        assert_eq!(pixels, last);
+        assert_eq!(repeated.outcome, once.outcome);
+        assert_eq!(repeated.first, once.first);
     }
 
     #[test]
