@@ -277,6 +277,10 @@ impl Mapper {
     fn extend(&mut self, input: &StepInput<'_>, change_begins: &mut dyn FnMut()) -> StepOutcome {
         let StepInput { frame, pose, .. } = *input;
         self.queue_frame(frame, pose);
+        if self.copies.is_repeat(frame) {
+            // Its noise is the previous frame's: observed twice, depth would seem more certain than it is.
+            return StepOutcome::default();
+        }
         self.guess_unit(&pose.keyframe_from_camera);
         let (unit, modes) = (self.depth.unit, &self.params.modes);
         self.modes.begin_frame(&self.depth.active, unit, &self.intrinsics, pose, modes);

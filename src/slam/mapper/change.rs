@@ -249,6 +249,16 @@ mod tests {
     /// Moves a camera sideways with exact poses, and exact depth for its first keyframe only; the fifth step proposes a
     /// keyframe. Returns the outcomes of the steps and of their deferred work, and the mapper.
     fn walk(params: MapperParams, steps: u64, finishes: bool) -> (Vec<[Taken; 2]>, Mapper) {
+        walk_with_repeats(params, steps, finishes, 0)
+    }
+
+    /// The same with each frame followed by `repeats` of it.
+    fn walk_with_repeats(
+        params: MapperParams,
+        steps: u64,
+        finishes: bool,
+        repeats: usize,
+    ) -> (Vec<[Taken; 2]>, Mapper) {
         let scene = Scene::new(3);
         let mut mapper = Mapper::new(CAMERA, params).unwrap();
         let outcomes = (0..steps).map(|k| {
@@ -273,7 +283,12 @@ mod tests {
             };
             let at_once = taken(step, &mapper);
             let rest = if finishes { mapper.finish_keyframe() } else { StepOutcome::default() };
-            [at_once, taken(rest, &mapper)]
+            let rest = taken(rest, &mapper);
+            for _ in 0..repeats {
+                let repeated = mapper.step(&frame, &pose, None, &mut || {});
+                assert_eq!(repeated, StepOutcome::default());
+            }
+            [at_once, rest]
         });
         (outcomes.collect(), mapper)
     }
@@ -296,6 +311,14 @@ mod tests {
             assert!(one.points == other.points, "keyframe {}", one.keyframe_id);
             assert_eq!(one.world_from_keyframe, other.world_from_keyframe);
         }
+    }
+
+    #[test]
+    fn repeated_images_change_nothing() {
+        let (once, mapper) = walk(MapperParams::default(), 6, true);
+        let (repeated, other) = walk_with_repeats(MapperParams::default(), 6, true, 2);
+        assert!(once == repeated && once[5][0].outcome.observations.fused > 100);
+        assert_eq!(mapper.past.newest_first().count(), other.past.newest_first().count());
     }
 
     /// Number of points that the second keyframe gets from the first one's depth, where its image has this brightness

@@ -13,20 +13,31 @@ pub(super) struct FrameCopies {
     copies: Vec<Arc<[u8]>>,
     /// The copy of the current frame.
     current: Option<Arc<[u8]>>,
+    /// That of the frame before it.
+    previous: Option<Arc<[u8]>>,
 }
 
 impl FrameCopies {
     /// Begins a new frame.
     pub(super) fn begin_frame(&mut self) {
-        self.current = None;
+        self.previous = self.current.take();
     }
 
-    /// The grey values of the current frame, copied at the first call.
+    /// Whether the current frame repeats the image of the previous one, bit for bit, as frames do in a video that was
+    /// converted to a higher rate.
+    pub(super) fn is_repeat(&self, frame: &FrameView<'_>) -> bool {
+        self.previous.as_deref() == Some(frame.pixels)
+    }
+
+    /// The grey values of the current frame, copied at the first call unless they repeat the previous frame's.
     pub(super) fn of(&mut self, frame: &FrameView<'_>) -> Arc<[u8]> {
         if let Some(copy) = &self.current {
             return Arc::clone(copy);
         }
-        let copy = self.copy(frame.pixels);
+        let copy = match &self.previous {
+            Some(previous) if self.is_repeat(frame) => Arc::clone(previous),
+            _ => self.copy(frame.pixels),
+        };
         self.current = Some(Arc::clone(&copy));
         copy
     }
@@ -76,6 +87,8 @@ mod tests {
         assert!((first[0], second[0]) == (1, 2));
         let memory = first.as_ptr();
         drop((first, same));
+        let repeated = copy_of(&mut copies, 2);
+        assert!(Arc::ptr_eq(&second, &repeated));
         let third = copy_of(&mut copies, 3);
         assert!(third[0] == 3 && third.as_ptr() == memory && second[0] == 2);
     }
@@ -86,6 +99,8 @@ mod tests {
         let kept: Vec<_> = (0..100).map(|grey| copy_of(&mut copies, grey)).collect();
         assert_eq!(copies.copies.len(), 100);
         drop(kept);
+        // A frame without a copy, after which the last one's is unused as well.
+        copies.begin_frame();
         let _ = copy_of(&mut copies, 0);
         assert_eq!(copies.copies.len(), MAX_SPARE);
         let kept = copy_of(&mut copies, 7);

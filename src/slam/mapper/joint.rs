@@ -207,14 +207,16 @@ impl Mapper {
         let [.., first, second] = &self.map.keyframes[..] else { return };
         let motion = first_from_second.log();
         let begin = first.sequence;
-        let interval = second.sequence.saturating_sub(begin).max(1) as f64;
-        for mut frame in self.early.drain(..) {
+        let (steps, num_repeats) = steps_of(&self.early);
+        let begin_at = self.early.iter().position(|frame| frame.sequence == begin);
+        let begin_step = begin_at.map_or(begin as f64, |at| steps[at]);
+        let interval = (second.sequence as f64 - num_repeats - begin_step).max(1.0);
+        for (mut frame, step) in self.early.drain(..).zip(steps) {
             if frame.sequence == begin {
                 continue;
             }
-            let share = (frame.sequence as f64 - begin as f64) / interval;
             frame.keyframe_id = first.keyframe_id;
-            frame.keyframe_from_camera = SE3::exp(&(motion * share));
+            frame.keyframe_from_camera = SE3::exp(&(motion * ((step - begin_step) / interval)));
             frame.is_guess = true;
             self.tracked.push(frame);
         }
@@ -243,6 +245,19 @@ impl Mapper {
     }
 }
 
+/// Where along the camera's motion each frame lies, in frames, and how many of them repeat the image of the frame before:
+/// a repeat is no step of the motion.
+fn steps_of(frames: &[TrackedFrame]) -> (Vec<f64>, f64) {
+    let mut num_repeats = 0.0;
+    let mut steps = Vec::with_capacity(frames.len());
+    for (index, frame) in frames.iter().enumerate() {
+        let before = index.checked_sub(1).map(|before| &frames[before].pixels);
+        num_repeats += f64::from(before.is_some_and(|before| Arc::ptr_eq(before, &frame.pixels)));
+        steps.push(frame.sequence as f64 - num_repeats);
+    }
+    (steps, num_repeats)
+}
+
 /// Appends the copy of a frame to a list of at most `most`; the oldest is dropped.
 fn push_bounded(
     frames: &mut Vec<TrackedFrame>,
@@ -260,4 +275,24 @@ fn push_bounded(
         is_guess: false,
         pixels,
     });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn repeated_images_are_no_steps_of_the_motion() {
+        let images: [Arc<[u8]>; 3] = [1, 2, 3].map(|grey| vec![grey; 4].into());
+        let frame = |(sequence, image): (u64, usize)| TrackedFrame {
+            sequence,
+            keyframe_id: NO_KEYFRAME,
+            keyframe_from_camera: SE3::identity(),
+            is_guess: true,
+            pixels: Arc::clone(&images[image]),
+        };
+        // The fourteenth frame was dropped.
+        let frames = [(10, 0), (11, 0), (12, 1), (13, 1), (15, 2), (16, 2)].map(frame);
+        assert_eq!(steps_of(&frames), (vec![10.0, 10.0, 11.0, 11.0, 13.0, 13.0], 3.0));
+    }
 }
