@@ -342,8 +342,7 @@ impl Tracker {
             return Some(LostReason::MapRejected);
         }
         let Intrinsics { width, height, .. } = self.intrinsics;
-        let fits = frame.is_consistent() && (frame.width, frame.height) == (width, height);
-        if !fits {
+        if !frame.is_consistent() || (frame.width, frame.height) != (width, height) {
             return Some(LostReason::UnusableFrame);
         }
         if *reference.intrinsics() != self.intrinsics {
@@ -351,6 +350,7 @@ impl Tracker {
         }
         self.turning.keep(&mut self.pyramid, frame.sequence);
         self.pyramid.fill(frame.pixels);
+        self.memory.motion.begin_frame(self.turning.is_repeat(&self.pyramid));
         let flat = self.pyramid.contrast() < self.params.min_contrast;
         flat.then_some(LostReason::UnusableFrame)
     }

@@ -17,7 +17,7 @@ pub fn grey_per_sum(level: usize) -> f32 {
 }
 
 /// Sums of one frame by level.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct SumPyramid {
     width: usize,
     height: usize,

@@ -15,20 +15,39 @@ pub struct Motion {
     last: Option<(i64, SE3)>,
     /// Twist of `last_from_next` per interval, and the interval in nanoseconds.
     velocity: Option<(Vector6<f64>, f64)>,
+    /// Frames since the last good pose, if all of them repeat its image.
+    repeats: Option<u32>,
 }
+
+/// Repeats of an image during which the camera is taken to move on: as many as in a video at three times its rate. After
+/// them it stands still.
+const MAX_REPEATS: u32 = 2;
 
 /// Longest extrapolation of a velocity, in intervals over which it was measured.
 const LONGEST_EXTRAPOLATION: f64 = 3.0;
 
 impl Motion {
-    /// Records a good pose.
+    /// Begins a frame, which may repeat the image of the previous one.
+    pub fn begin_frame(&mut self, is_repeat: bool) {
+        self.repeats = self.repeats.filter(|_| is_repeat).map(|repeats| repeats.saturating_add(1));
+    }
+
+    fn is_repeat(&self) -> bool {
+        self.repeats.is_some_and(|repeats| (1..=MAX_REPEATS).contains(&repeats))
+    }
+
+    /// Records a good pose. That of a repeated image shows no motion, and is left out.
     pub fn observe(&mut self, nanos: i64, world_from_camera: &SE3) {
+        if self.is_repeat() {
+            return;
+        }
         self.velocity = self.last.and_then(|(before, last)| {
             let interval = nanos.checked_sub(before).filter(|&interval| interval > 0)?;
             let twist = (last.inverse() * *world_from_camera).log();
             Some((twist, interval as f64))
         });
         self.last = Some((nanos, *world_from_camera));
+        self.repeats = Some(0);
     }
 
     /// Moves the poses with the keyframe that they are relative to.
@@ -47,7 +66,7 @@ impl Motion {
 
     /// Forgets the velocity: after a loss only the position is used.
     pub fn stop(&mut self) {
-        self.velocity = None;
+        (self.velocity, self.repeats) = (None, None);
     }
 
     /// The last step: twist of `before_from_last`, world units and radians, and its duration in seconds; `None` where
@@ -86,10 +105,12 @@ impl Motion {
         self.last
     }
 
-    /// The pose at `nanos` if the camera continues with `factor` times its velocity; `None` before the first pose.
+    /// The pose at `nanos` if the camera continues with `factor` times its velocity, the last one if its image is repeated;
+    /// `None` before the first pose.
     pub fn predict(&self, nanos: i64, factor: f64) -> Option<SE3> {
         let (before, last) = self.last?;
-        let Some((twist, interval)) = self.velocity else { return Some(last) };
+        let moving = self.velocity.filter(|_| !self.is_repeat());
+        let Some((twist, interval)) = moving else { return Some(last) };
         let elapsed = nanos.saturating_sub(before) as f64;
         let share = (elapsed / interval).clamp(0.0, LONGEST_EXTRAPOLATION);
         Some(last * SE3::exp(&(twist * (factor * share))))
@@ -154,6 +175,35 @@ mod tests {
         let expected = pose([1.0; 6]) * step * step * step;
         let predicted = motion.predict(99, 1.0).unwrap();
         assert!((predicted.inverse() * expected).log().norm() < 1e-12);
+    }
+
+    #[test]
+    fn constant_velocity_continues_over_repeated_images_but_not_over_a_rest() {
+        let step = pose([0.1, 0.0, 0.02, 0.01, -0.03, 0.02]);
+        let mut motion = Motion::default();
+        let see = |motion: &mut Motion, nanos: i64, is_repeat: bool, at: &SE3| {
+            motion.begin_frame(is_repeat);
+            let predicted = motion.predict(nanos, 1.0);
+            motion.observe(nanos, at);
+            predicted.map(|predicted| (predicted.inverse() * *at).log().norm())
+        };
+        let at = [SE3::identity(), step, step * step, step * step * step];
+        assert_eq!(see(&mut motion, 0, true, &at[0]), None, "nothing was seen before");
+        see(&mut motion, 33, true, &at[0]);
+        for (k, nanos) in (1..4).zip([66, 132, 198]) {
+            let error = see(&mut motion, nanos, false, &at[k]).unwrap();
+            assert!(k == 1 || error < 1e-12, "{k}: {error}");
+            assert!(see(&mut motion, nanos + 33, true, &at[k]).unwrap() < 1e-12);
+        }
+        // The same image for long: the camera stands.
+        for nanos in [264, 297, 330] {
+            see(&mut motion, nanos, true, &at[3]);
+        }
+        assert!(see(&mut motion, 363, false, &at[3]).unwrap() < 1e-12);
+        // After a loss the image that was lost counts as seen for the first time.
+        motion.stop();
+        see(&mut motion, 396, true, &at[1]);
+        assert_eq!(motion.last(), Some(at[1]));
     }
 
     #[test]

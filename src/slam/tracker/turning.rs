@@ -168,6 +168,11 @@ impl Turning {
         self.frames.before = self.frames.filled.replace(sequence);
     }
 
+    /// Whether the frame in `pyramid` repeats the image of the previous one.
+    pub(super) fn is_repeat(&self, pyramid: &SumPyramid) -> bool {
+        self.frames.before.is_some() && self.before == *pyramid
+    }
+
     /// Makes the frame in `pyramid` the view, if that is due; the contents of the old view are left in its place.
     pub(super) fn prepare(&mut self, intrinsics: &Intrinsics, pyramid: &mut SumPyramid) {
         if !std::mem::take(&mut self.is_due) {
