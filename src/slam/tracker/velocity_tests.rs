@@ -95,6 +95,19 @@ fn a_steady_camera_has_its_velocity_within_the_covariance() {
 }
 
 #[test]
+fn a_camera_whose_images_are_repeated_moves_at_half_the_speed_and_does_not_stop() {
+    let mut camera = Camera::on(&keyframe());
+    camera.see(0);
+    for index in 1..=12 {
+        for repeat in 0..2 {
+            let velocity = camera.see_at(index, nanos(2 * index + repeat)).velocity.unwrap();
+            let exact = step() / (2.0 * INTERVAL);
+            assert!(normalized(&velocity, &exact) < RARE, "frame {index}: {velocity:?}");
+        }
+    }
+}
+
+#[test]
 fn there_is_no_velocity_without_two_poses_in_a_row() {
     let mut camera = Camera::on(&keyframe());
     let known = |camera: &mut Camera, index: u64| camera.see(index).is_some();
