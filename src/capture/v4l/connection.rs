@@ -45,6 +45,7 @@ struct Stream<D> {
     /// Buffers to be returned to the driver.
     idle: Vec<usize>,
     since_nanos: i64,
+    /// When the newest frame that was not damaged was taken.
     newest_nanos: i64,
     /// Whether only damaged frames have arrived since.
     is_damaged: bool,
@@ -231,13 +232,15 @@ impl<S: VideoSystem> Camera<S> {
         }
         let now = self.system.now_nanos();
         let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
-        if let Some(held) = stream.held {
+        let silent_nanos = now.saturating_sub(stream.newest_nanos);
+        let is_stalled = silent_nanos as f64 > self.params.stall_s * 1e9;
+        // One that may be no picture either does not end the stall.
+        if let Some(held) = stream.held.filter(|_| !is_stalled || !stream.is_damaged) {
             self.has_streamed = true;
             self.last_nanos = Some(held.stamp.capture_nanos);
             return Ok(Arrival::Frame);
         }
-        let silent_nanos = now.saturating_sub(stream.newest_nanos);
-        if silent_nanos as f64 > self.params.stall_s * 1e9 {
+        if is_stalled {
             let path = stream.path.display();
             let seconds = self.params.stall_s;
             let what = if stream.is_damaged { "only damaged frames" } else { "no frame" };
@@ -285,10 +288,7 @@ impl<S: VideoSystem> Camera<S> {
             };
             count += 1;
             let is_damaged = filled.flags & FLAG_ERROR != 0;
-            stream.is_damaged = is_damaged;
-            if !is_damaged {
-                stream.newest_nanos = arrival_nanos;
-            }
+            stream.is_damaged |= is_damaged;
             let (sequence, missing) = self.numbers.number(filled.sequence);
             self.losses.missing += missing;
             let mut taken = taken(&filled, arrival_nanos, stream.exposure.nanos, offset_nanos);
@@ -299,7 +299,11 @@ impl<S: VideoSystem> Camera<S> {
                 taken.nanos =
                     before.map_or(taken.nanos, |before| taken.nanos.max(before.saturating_add(1)));
             }
-            let is_broken = is_damaged || before.is_some_and(|before| taken.nanos <= before);
+            let is_old = before.is_some_and(|before| taken.nanos <= before);
+            if is_old && !is_damaged {
+                stream.saw_picture(arrival_nanos);
+            }
+            let is_broken = is_damaged || is_old;
             self.refused_in_a_row = if is_broken { self.refused_in_a_row + 1 } else { 0 };
             if is_broken {
                 self.losses.broken += 1;
@@ -340,7 +344,12 @@ impl<S: VideoSystem> Camera<S> {
     /// Returns the held frame's buffer to the driver; `is_broken` if it was not a picture.
     pub fn release(&mut self, is_broken: bool) {
         self.losses.broken += u64::from(is_broken);
+        let now = self.system.now_nanos();
         let State::Streaming(stream) = &mut self.state else { return };
+        match is_broken {
+            true => stream.is_damaged = true,
+            false => stream.saw_picture(now),
+        }
         if let Some(held) = stream.held.take() {
             stream.idle.push(held.filled.index);
             // A refusal is retried at the next check, which also reports it.
@@ -356,6 +365,10 @@ fn note(notices: &mut VecDeque<Notice>, text: String, is_warning: bool) {
 }
 
 impl<D: VideoDevice> Stream<D> {
+    fn saw_picture(&mut self, nanos: i64) {
+        (self.newest_nanos, self.is_damaged) = (nanos, false);
+    }
+
     /// Returns idle buffers to the driver. One that it refuses is kept for the next check; a driver that has none left,
     /// or is gone, is an absence.
     fn return_idle(&mut self) -> Result<(), Absence> {

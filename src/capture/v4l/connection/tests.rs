@@ -245,6 +245,34 @@ fn a_camera_whose_frames_are_all_damaged_is_reopened() {
 }
 
 #[test]
+fn a_camera_whose_frames_are_no_pictures_is_reopened() {
+    let fake = Fake::default();
+    let mut camera = camera(&fake);
+    take(&fake, &mut camera, 0);
+    // A few may be.
+    for sequence in 1..180 {
+        fake.pass(FRAME_NANOS);
+        fake.give(frame(sequence, vec![7; 640 * 480]));
+        assert_eq!(camera.await_frame(None, 10), Ok(Arrival::Frame), "{sequence}");
+        camera.release(sequence % 30 != 0);
+    }
+    let mut reason = None;
+    for sequence in 180..300 {
+        fake.pass(FRAME_NANOS);
+        fake.give(frame(sequence, vec![7; 640 * 480]));
+        match camera.await_frame(None, 10).unwrap() {
+            Arrival::Absent(text) => reason = Some(text),
+            _ if reason.is_none() => camera.release(true),
+            _ => break,
+        }
+    }
+    assert_eq!(reason.as_deref(), Some("/dev/video0: has delivered only damaged frames for 2 s"));
+    come_back(&mut camera);
+    take(&fake, &mut camera, 0);
+    assert_eq!(fake.opened(), 2);
+}
+
+#[test]
 fn a_buffer_that_is_refused_once_is_enqueued_again() {
     let fake = Fake::default();
     let mut camera = camera(&fake);
