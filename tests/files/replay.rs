@@ -17,8 +17,16 @@ const HALF_SIZE: [&str; 6] = [
     "simulator.focal_px=262.5",
 ];
 
+/// The real binary, which finds no journals of other runs: its runtime folder is `root` below `folder`.
+fn semidense(folder: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_semidense"));
+    command.env("SEMIDENSE_ROOT", folder.join("root"));
+    command
+}
+
 fn replay(arguments: &[&str], output: &Path) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_semidense"))
+    let root = tempfile::tempdir().unwrap();
+    semidense(root.path())
         .args(["replay", "--output"])
         .arg(output)
         .args(arguments)
@@ -162,7 +170,7 @@ fn sources_that_cannot_be_replayed_give_one_clear_line() {
 #[test]
 fn an_invalid_instance_name_is_refused_before_the_work() {
     let folder = tempfile::tempdir().unwrap();
-    let replayed = Command::new(env!("CARGO_BIN_EXE_semidense"))
+    let replayed = semidense(folder.path())
         .args(["replay", "sim", "--instance", "a/b", "--output"])
         .arg(folder.path().join("output"))
         .output()
@@ -178,7 +186,8 @@ fn results_survive_a_replay_that_is_interrupted_before_its_first_frame() {
     let earlier = folder.path().join("trajectory.txt");
     let of_an_earlier_run = "# world_from_camera of every tracked frame: of an earlier run\n";
     std::fs::write(&earlier, of_an_earlier_run).unwrap();
-    let mut child = Command::new(env!("CARGO_BIN_EXE_semidense"))
+    let root = tempfile::tempdir().unwrap();
+    let mut child = semidense(root.path())
         .args(["replay", "sim", "--output"])
         .arg(folder.path())
         .stderr(Stdio::piped())
@@ -200,7 +209,7 @@ fn results_cover_the_frames_before_one_that_cannot_be_read() {
     let folder = tempfile::tempdir().unwrap();
     let (recording, output) = (folder.path().join("recording"), folder.path().join("output"));
     let sizes = ["--set", "simulator.width=160", "--set", "simulator.height=120"];
-    let made = Command::new(env!("CARGO_BIN_EXE_semidense"))
+    let made = semidense(folder.path())
         .args(["simulate", "--layout", "tum", "--set", "simulator.frames=8"])
         .args(sizes)
         .arg("--output")
