@@ -278,7 +278,9 @@ impl Mapper {
         let StepInput { frame, pose, .. } = *input;
         self.queue_frame(frame, pose);
         if self.copies.is_repeat(frame) {
-            // Its noise is the previous frame's: observed twice, depth would seem more certain than it is.
+            // Its noise is the previous frame's: observed twice, depth would seem more certain than it is. The next
+            // frame may repeat it again.
+            self.copies.of(frame);
             return StepOutcome::default();
         }
         self.guess_unit(&pose.keyframe_from_camera);

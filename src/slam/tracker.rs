@@ -272,7 +272,7 @@ impl Tracker {
                 let is_lost = matches!(estimate.state, TrackingState::Lost(_));
                 self.memory.coarse_fit = coarse_fit.filter(|_| !is_lost).or(self.memory.coarse_fit);
                 let held = match may_turn(estimate.state) {
-                    true => self.turn(&reference, frame, &before, budget),
+                    true => self.turn(&reference, frame, before, budget),
                     false => {
                         self.end_turning();
                         let may_be_next = self.params.max_turning_deviation > 0.0;

@@ -45,10 +45,12 @@ struct Stream<D> {
     /// Buffers to be returned to the driver.
     idle: Vec<usize>,
     since_nanos: i64,
-    /// When the newest frame that was not damaged was taken.
+    /// When the newest frame that is a picture was released, or one arrived that was refused for its stamp alone.
     newest_nanos: i64,
-    /// Whether only damaged frames have arrived since.
+    /// Whether a damaged frame, or one that is no picture, has arrived since.
     is_damaged: bool,
+    /// Whether the frame released last was no picture.
+    is_unreadable: bool,
     exposure: Exposure,
     exposure_nanos: i64,
     lock_is_due: bool,
@@ -208,6 +210,7 @@ impl<S: VideoSystem> Camera<S> {
             since_nanos: now,
             newest_nanos: now,
             is_damaged: false,
+            is_unreadable: false,
             exposure,
             exposure_nanos: now,
             lock_is_due: controls::has_locks(&self.params),
@@ -222,6 +225,10 @@ impl<S: VideoSystem> Camera<S> {
         if stream.held.is_some() {
             return Ok(Arrival::Frame);
         }
+        // Before the next frame, which may be no picture either.
+        if stream.is_unreadable {
+            stream.check_stall(self.system.now_nanos(), self.params.stall_s)?;
+        }
         stream.return_idle()?;
         self.update_exposure();
         let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
@@ -232,22 +239,12 @@ impl<S: VideoSystem> Camera<S> {
         }
         let now = self.system.now_nanos();
         let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
-        let silent_nanos = now.saturating_sub(stream.newest_nanos);
-        let is_stalled = silent_nanos as f64 > self.params.stall_s * 1e9;
-        // One that may be no picture either does not end the stall.
-        if let Some(held) = stream.held.filter(|_| !is_stalled || !stream.is_damaged) {
+        if let Some(held) = stream.held {
             self.has_streamed = true;
             self.last_nanos = Some(held.stamp.capture_nanos);
             return Ok(Arrival::Frame);
         }
-        if is_stalled {
-            let path = stream.path.display();
-            let seconds = self.params.stall_s;
-            let what = if stream.is_damaged { "only damaged frames" } else { "no frame" };
-            return Err(Absence::transient(format!(
-                "{path}: has delivered {what} for {seconds} s"
-            )));
-        }
+        stream.check_stall(now, self.params.stall_s)?;
         Ok(Arrival::Nothing)
     }
 
@@ -347,7 +344,7 @@ impl<S: VideoSystem> Camera<S> {
         let now = self.system.now_nanos();
         let State::Streaming(stream) = &mut self.state else { return };
         match is_broken {
-            true => stream.is_damaged = true,
+            true => (stream.is_damaged, stream.is_unreadable) = (true, true),
             false => stream.saw_picture(now),
         }
         if let Some(held) = stream.held.take() {
@@ -366,7 +363,18 @@ fn note(notices: &mut VecDeque<Notice>, text: String, is_warning: bool) {
 
 impl<D: VideoDevice> Stream<D> {
     fn saw_picture(&mut self, nanos: i64) {
-        (self.newest_nanos, self.is_damaged) = (nanos, false);
+        self.newest_nanos = nanos;
+        (self.is_damaged, self.is_unreadable) = (false, false);
+    }
+
+    /// An absence where there has been no picture for longer than `stall_s`, seconds.
+    fn check_stall(&self, now: i64, stall_s: f64) -> Result<(), Absence> {
+        if now.saturating_sub(self.newest_nanos) as f64 <= stall_s * 1e9 {
+            return Ok(());
+        }
+        let path = self.path.display();
+        let what = if self.is_damaged { "only damaged frames" } else { "no frame" };
+        Err(Absence::transient(format!("{path}: has delivered {what} for {stall_s} s")))
     }
 
     /// Returns idle buffers to the driver. One that it refuses is kept for the next check; a driver that has none left,

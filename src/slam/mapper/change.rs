@@ -315,10 +315,15 @@ mod tests {
 
     #[test]
     fn repeated_images_change_nothing() {
-        let (once, mapper) = walk(MapperParams::default(), 6, true);
-        let (repeated, other) = walk_with_repeats(MapperParams::default(), 6, true, 2);
-        assert!(once == repeated && once[5][0].outcome.observations.fused > 100);
-        assert_eq!(mapper.past.newest_first().count(), other.past.newest_first().count());
+        let mut params = MapperParams::default();
+        // With copies of all frames, and of those alone that give depth to new pixels.
+        for num_free in [params.window.num_free, 0] {
+            params.window.num_free = num_free;
+            let (once, mapper) = walk(params.clone(), 6, true);
+            let (repeated, other) = walk_with_repeats(params.clone(), 6, true, 3);
+            assert!(once == repeated && once[5][0].outcome.observations.fused > 100);
+            assert_eq!(mapper.past.newest_first().count(), other.past.newest_first().count());
+        }
     }
 
     /// Number of points that the second keyframe gets from the first one's depth, where its image has this brightness

@@ -208,8 +208,11 @@ impl Mapper {
         let motion = first_from_second.log();
         let begin = first.sequence;
         let (steps, num_repeats) = steps_of(&self.early);
-        let begin_at = self.early.iter().position(|frame| frame.sequence == begin);
-        let begin_step = begin_at.map_or(begin as f64, |at| steps[at]);
+        // Of a first image that was repeated for long only the last repeats may be left.
+        let shows_first =
+            |frame: &TrackedFrame| frame.sequence == begin || frame.pixels == first.image;
+        let begin_step =
+            self.early.iter().position(shows_first).map_or(begin as f64, |at| steps[at]);
         let interval = (second.sequence as f64 - num_repeats - begin_step).max(1.0);
         for (mut frame, step) in self.early.drain(..).zip(steps) {
             if frame.sequence == begin {

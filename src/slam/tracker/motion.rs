@@ -32,7 +32,8 @@ impl Motion {
         self.repeats = self.repeats.filter(|_| is_repeat).map(|repeats| repeats.saturating_add(1));
     }
 
-    fn is_repeat(&self) -> bool {
+    /// Whether the frame repeats the image of the last good pose, and the camera is taken to move on.
+    pub fn is_repeat(&self) -> bool {
         self.repeats.is_some_and(|repeats| (1..=MAX_REPEATS).contains(&repeats))
     }
 
@@ -109,7 +110,7 @@ impl Motion {
     /// `None` before the first pose.
     pub fn predict(&self, nanos: i64, factor: f64) -> Option<SE3> {
         let (before, last) = self.last?;
-        let moving = self.velocity.filter(|_| !self.is_repeat());
+        let moving = self.velocity.filter(|_| self.repeats.is_none_or(|repeats| repeats == 0));
         let Some((twist, interval)) = moving else { return Some(last) };
         let elapsed = nanos.saturating_sub(before) as f64;
         let share = (elapsed / interval).clamp(0.0, LONGEST_EXTRAPOLATION);
@@ -197,7 +198,7 @@ mod tests {
         }
         // The same image for long: the camera stands.
         for nanos in [264, 297, 330] {
-            see(&mut motion, nanos, true, &at[3]);
+            assert!(see(&mut motion, nanos, true, &at[3]).unwrap() < 1e-12, "{nanos}");
         }
         assert!(see(&mut motion, 363, false, &at[3]).unwrap() < 1e-12);
         // After a loss the image that was lost counts as seen for the first time.

@@ -130,7 +130,12 @@ impl Tracker {
             by_mode: alignment.d_pose_d_modes(reference).unwrap_or_default(),
             modes: *reference.mode_covariance(),
         };
-        let velocity = self.memory.velocity.observe(errors, self.memory.motion.last_step());
+        let motion = &self.memory.motion;
+        // A repeated image shows none.
+        let velocity = match motion.is_repeat() {
+            true => None,
+            false => self.memory.velocity.observe(errors, motion.last_step()),
+        };
         PoseEstimate {
             world_from_camera,
             map_from_camera,

@@ -225,17 +225,17 @@ impl Turning {
 }
 
 impl Tracker {
-    /// Holds a frame that was lost on `reference` to the previous view. `before` is the memory before the loss.
+    /// Holds a frame that was lost on `reference` to the previous view. `before` is the memory before this frame.
     pub(super) fn turn(
         &mut self,
         reference: &Reference,
         frame: &FrameView<'_>,
-        before: &Memory,
+        mut before: Memory,
         budget: &mut dyn FnMut(usize) -> bool,
     ) -> Option<PoseEstimate> {
-        let unit = reference.mean_depth_in_world();
+        before.motion.begin_frame(self.turning.is_repeat(&self.pyramid));
         if self.turning.place.is_none() {
-            self.begin_turning(before, unit);
+            self.begin_turning(&before, reference.mean_depth_in_world());
         }
         let place = self.turning.place?;
         let since_view = frame.capture_nanos.saturating_sub(place.nanos) as f64 * 1e-9;
@@ -244,7 +244,7 @@ impl Tracker {
             return None;
         }
         let mut view = self.turning.view.take()?;
-        let lost = self.restore_memory(before);
+        let lost = self.restore_memory(&before);
         let step = since_view.max(MIN_SECONDS);
         view.place_view(&place.world_from_view, TIGHTNESS * place.speed * step);
         let mut next = ViewPose { since_secs: place.since_secs + step, ..place };
@@ -265,7 +265,7 @@ impl Tracker {
             self.memory = lost;
             if is_cut_short && since_view >= 0.0 {
                 // This frame tells nothing: the view waits for the next one, of which the same motion is expected.
-                self.memory.motion = before.motion.clone();
+                self.memory.motion = before.motion;
             } else {
                 self.end_turning();
             }

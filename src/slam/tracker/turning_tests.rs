@@ -137,6 +137,27 @@ fn a_keyframe_hidden_without_a_rotation_is_not_held_for_long() {
 }
 
 #[test]
+fn a_repeated_image_before_the_hold_does_not_stop_the_pan() {
+    let (scene, other) = (Scene::new(3), Scene::new(9).keyframe(2, SE3::identity(), 2.0));
+    let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
+    tracker.adopt(Box::new(Reference::prepare(&scene.keyframe(1, SE3::identity(), 2.0))));
+    for (frame, image) in (0..).zip([0, 1, 2, 3, 3, 4, 5, 6, 7]) {
+        let truth = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 0.1 * image as f64, 0.0));
+        let pixels = scene.render(&CAMERA, &truth).noisy(2.0, 10 + image);
+        let seen = FrameView::new(&CAMERA, frame, frame as i64 * 33_333_333, &pixels);
+        let estimate = tracker.track(&seen, &mut |_| true);
+        let expected = if frame < 5 { TrackingState::Tracking } else { TURNING };
+        assert_eq!(estimate.state, expected, "frame {frame}");
+        let error = estimate.world_from_camera.rotation.angle_to(&truth.rotation);
+        assert!(error < 0.03, "frame {frame}: {error}");
+        if frame == 4 {
+            // It shows another room at the same pose.
+            tracker.adopt(Box::new(Reference::prepare(&other)));
+        }
+    }
+}
+
+#[test]
 fn a_find_that_is_rotated_against_the_held_pose_is_refused() {
     const AT: u64 = 24;
     let found = Scene::new(3).keyframe(2, panned(AT, 0.0), 2.0);
