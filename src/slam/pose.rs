@@ -163,7 +163,7 @@ pub struct PoseEstimate {
     /// for fusion. The mapper weights matches with it.
     pub alignment_covariance: [f64; 21],
     /// The camera's velocity; `None` where this frame or the previous one has no pose, or they belong to different
-    /// epochs, and while a view is held ([`DegradedReason::Turning`]).
+    /// epochs, while a view is held ([`DegradedReason::Turning`]), and where the frame repeats the previous image.
     pub velocity: Option<Velocity>,
     /// Brightness against the keyframe.
     pub brightness: Brightness,
