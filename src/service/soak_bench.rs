@@ -44,7 +44,7 @@ pub struct Soak {
 }
 
 /// The state of the processes at one instant, and the times of the frames since the previous sample.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
     /// Since the first frame, seconds.
     pub seconds: f64,
@@ -52,46 +52,25 @@ pub struct Sample {
     pub frames: u64,
     /// Frames without a pose, because a newer one had arrived.
     pub dropped: u64,
-    /// Keyframes with image and depth.
-    pub keyframes: u64,
-    /// Time of the tracker per frame, milliseconds: median.
-    pub track_p50_ms: f64,
-    /// 99 of 100 are not longer.
-    pub track_p99_ms: f64,
-    /// Time of the mapper per frame: median.
-    pub map_p50_ms: f64,
-    /// 99 of 100 are not longer.
-    pub map_p99_ms: f64,
-    /// CPU time of a joint estimate: median.
-    pub adjust_p50_ms: f64,
-    /// 99 of 100 are not longer.
-    pub adjust_p99_ms: f64,
-    /// Resident memory of capture, without what the processes share, megabytes.
-    pub capture_mb: f64,
-    /// That of the tracker.
-    pub tracker_mb: f64,
-    /// That of the mapper.
-    pub mapper_mb: f64,
-    /// That of the process that monitors and collects the poses.
-    pub supervisor_mb: f64,
+    /// The quantities whose trend is reported, in the order of [`COLUMNS`].
+    values: Vec<f64>,
 }
 
-/// A column of the samples.
-type Column = (&'static str, fn(&Sample) -> f64);
-
-/// The columns whose trend is reported.
-const COLUMNS: [Column; 11] = [
-    ("keyframes", |s| s.keyframes as f64),
-    ("track_p50_ms", |s| s.track_p50_ms),
-    ("track_p99_ms", |s| s.track_p99_ms),
-    ("map_p50_ms", |s| s.map_p50_ms),
-    ("map_p99_ms", |s| s.map_p99_ms),
-    ("adjust_p50_ms", |s| s.adjust_p50_ms),
-    ("adjust_p99_ms", |s| s.adjust_p99_ms),
-    ("capture_mb", |s| s.capture_mb),
-    ("tracker_mb", |s| s.tracker_mb),
-    ("mapper_mb", |s| s.mapper_mb),
-    ("supervisor_mb", |s| s.supervisor_mb),
+/// Names of the quantities whose trend is reported: keyframes with image and depth; times of the tracker and of the
+/// mapper per frame and CPU time of a joint estimate, milliseconds; resident memory of each process without what the
+/// processes share, megabytes, where the supervisor is the process that monitors and collects the poses.
+const COLUMNS: [&str; 11] = [
+    "keyframes",
+    "track_p50_ms",
+    "track_p99_ms",
+    "map_p50_ms",
+    "map_p99_ms",
+    "adjust_p50_ms",
+    "adjust_p99_ms",
+    "capture_mb",
+    "tracker_mb",
+    "mapper_mb",
+    "supervisor_mb",
 ];
 
 /// The trend of a quantity over time.
@@ -174,25 +153,20 @@ impl Watch {
         self.next = Instant::now() + self.period;
         let [tracker, mapper] = [TRACKER, MAPPER].map(|process| &heard[process]);
         let counts = [tracker.work_counts, mapper.work_counts, mapper.adjustment_counts];
-        let times: Vec<[f64; 2]> =
-            counts.iter().zip(&self.before).map(|(now, before)| times_since(now, before)).collect();
+        let times = [0, 1, 2].map(|of| times_since(&counts[of], &self.before[of]));
         self.before = counts;
-        let memory = |process: u32| resident_mb(&process.to_string());
+        let keyframes = [mapper.total as f64];
+        let children = heard.iter().map(|process| process.process_id.to_string());
+        let memory = children.chain(["self".to_owned()]).map(|process| resident_mb(&process));
         self.samples.push(Sample {
             seconds: started.elapsed().as_secs_f64(),
             frames: tracker.frames,
             dropped: tracker.dropped,
-            keyframes: mapper.total,
-            track_p50_ms: times[0][0],
-            track_p99_ms: times[0][1],
-            map_p50_ms: times[1][0],
-            map_p99_ms: times[1][1],
-            adjust_p50_ms: times[2][0],
-            adjust_p99_ms: times[2][1],
-            capture_mb: memory(heard[0].process_id),
-            tracker_mb: memory(tracker.process_id),
-            mapper_mb: memory(mapper.process_id),
-            supervisor_mb: resident_mb("self"),
+            values: keyframes
+                .into_iter()
+                .chain(times.into_iter().flatten())
+                .chain(memory)
+                .collect(),
         });
     }
 }
@@ -227,26 +201,26 @@ pub fn trends(samples: &[Sample]) -> Vec<Trend> {
         return Vec::new();
     }
     let (warm, last) = (&samples[quarter..], &samples[samples.len() - quarter..]);
-    let of = |(name, value): &Column| Trend {
+    let of = |(column, name): (usize, &&'static str)| Trend {
         name,
-        second_quarter: mean(&warm[..quarter], *value),
-        last_quarter: mean(last, *value),
-        per_hour: slope(warm, *value) * 3600.0,
+        second_quarter: mean(&warm[..quarter], column),
+        last_quarter: mean(last, column),
+        per_hour: slope(warm, column) * 3600.0,
     };
-    COLUMNS.iter().map(of).collect()
+    COLUMNS.iter().enumerate().map(of).collect()
 }
 
 /// Mean of the finite values.
-fn mean(samples: &[Sample], value: fn(&Sample) -> f64) -> f64 {
-    let values = samples.iter().map(value).filter(|value| value.is_finite());
+fn mean(samples: &[Sample], column: usize) -> f64 {
+    let values = samples.iter().map(|of| of.values[column]).filter(|value| value.is_finite());
     let (sum, count) = values.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));
     sum / count
 }
 
 /// Slope of the least-squares line, per second.
-fn slope(samples: &[Sample], value: fn(&Sample) -> f64) -> f64 {
+fn slope(samples: &[Sample], column: usize) -> f64 {
     let points = || {
-        let all = samples.iter().map(|sample| (sample.seconds, value(sample)));
+        let all = samples.iter().map(|sample| (sample.seconds, sample.values[column]));
         all.filter(|(_, value)| value.is_finite())
     };
     let count = points().count() as f64;
@@ -260,14 +234,12 @@ fn slope(samples: &[Sample], value: fn(&Sample) -> f64) -> f64 {
 
 /// The samples as comma-separated lines, the first with the column names; unknown values are left empty.
 pub fn csv(samples: &[Sample]) -> String {
-    let names = COLUMNS.map(|(name, _)| name).join(",");
-    let mut text = format!("seconds,frames,dropped,{names}\n");
+    let mut text = format!("seconds,frames,dropped,{}\n", COLUMNS.join(","));
     for sample in samples {
-        let Sample { seconds, frames, dropped, .. } = sample;
+        let Sample { seconds, frames, dropped, values } = sample;
         // Writing to a string does not fail.
         let _ = write!(text, "{seconds:.1},{frames},{dropped}");
-        for (_, value) in COLUMNS {
-            let value = value(sample);
+        for value in values {
             let _ = if value.is_finite() { write!(text, ",{value:.3}") } else { write!(text, ",") };
         }
         text.push('\n');
@@ -280,14 +252,18 @@ mod tests {
     use super::*;
 
     fn samples() -> Vec<Sample> {
+        // 40 per hour, and flat.
+        let value = |k: u32, name: &str| match name {
+            "keyframes" => (40 * u64::from(k) / 360) as f64,
+            "mapper_mb" => 100.0 + 40.0 * 10.0 * f64::from(k) / 3600.0,
+            "track_p50_ms" => [3.0, f64::NAN][usize::from(k == 390)],
+            _ => 0.0,
+        };
         let sample = |k: u32| Sample {
             seconds: 10.0 * f64::from(k),
             frames: 300 * u64::from(k),
-            // 40 per hour, and flat.
-            keyframes: 40 * u64::from(k) / 360,
-            mapper_mb: 100.0 + 40.0 * 10.0 * f64::from(k) / 3600.0,
-            track_p50_ms: if k == 390 { f64::NAN } else { 3.0 },
-            ..Sample::default()
+            dropped: 0,
+            values: COLUMNS.map(|name| value(k, name)).to_vec(),
         };
         (0..400).map(sample).collect()
     }
