@@ -7,7 +7,6 @@ use std::time::Instant;
 use semidense::service::map_folder::depth_file::MapDetail;
 use semidense::service::map_folder::reading::load;
 use semidense::service::map_folder::write_new;
-use semidense::service::map_folder::writer::MapHead;
 use semidense::slam::keyframe::Keyframe;
 use semidense::slam::map::Map;
 use semidense::slam::mapper::prior::MapUse;
@@ -33,9 +32,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             Keyframe { keyframe_id, description, ..of.clone() }
         });
         let map = Map { keyframes: numbered.collect(), ..Map::default() };
-        let keyframes = map.keyframes.iter().map(Keyframe::without_depth).collect();
-        let head = MapHead { keyframes, free_epoch: 1, ..MapHead::default() };
-        write_new(folder.path(), &camera, detail, &map, head, &mut || ())?;
+        write_new(folder.path(), &camera, detail, &map, 1, &mut || ())?;
         drop(map);
         for _ in 0..REPETITIONS {
             let begin = Instant::now();

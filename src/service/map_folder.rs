@@ -29,9 +29,9 @@ pub mod writer;
 use std::path::Path;
 
 use crate::service::map_folder::depth_file::MapDetail;
-use crate::service::map_folder::keeper::{is_kept, map_head};
+use crate::service::map_folder::keeper::is_kept;
 use crate::service::map_folder::map_folder_error::MapFolderError;
-use crate::service::map_folder::writer::{MapHead, MapWriter};
+use crate::service::map_folder::writer::{MapWriter, head_of};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;
 use crate::slam::mapper::Mapper;
@@ -45,7 +45,7 @@ pub fn save_copy(
 ) -> Result<(), MapFolderError> {
     let camera = mapper.keyframe().or(mapper.map().keyframes.last()).map(|of| of.intrinsics);
     let camera = camera.ok_or(MapFolderError::Empty)?;
-    write_new(folder, &camera, detail, mapper.map(), map_head(mapper), each)
+    write_new(folder, &camera, detail, mapper.map(), mapper.free_epoch(), each)
 }
 
 /// Writes a map into a folder that holds none.
@@ -54,7 +54,7 @@ pub fn write_new(
     camera: &Intrinsics,
     detail: MapDetail,
     map: &Map,
-    head: MapHead,
+    free_epoch: u32,
     each: &mut dyn FnMut(),
 ) -> Result<(), MapFolderError> {
     let mut writer = MapWriter::open(folder, detail)?;
@@ -65,7 +65,7 @@ pub fn write_new(
         each();
         writer.put(keyframe)?;
     }
-    writer.save(camera, head)
+    writer.save(camera, head_of(map, free_epoch))
 }
 
 #[cfg(test)]

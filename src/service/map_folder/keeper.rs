@@ -13,7 +13,7 @@ use std::time::Instant;
 
 use crate::service::map_folder::map_folder_error::MapFolderError;
 use crate::service::map_folder::numbering::Numbering;
-use crate::service::map_folder::writer::{MapHead, MapWriter};
+use crate::service::map_folder::writer::{MapWriter, head_of};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::map::Map;
@@ -48,7 +48,7 @@ struct Shared {
 #[derive(Debug, Default)]
 struct Waiting {
     keyframes: BTreeMap<u64, Keyframe>,
-    head: Option<MapHead>,
+    head: Option<Map>,
     is_over: bool,
     is_busy: bool,
     /// Keyframes of failed saves, which are handed over again.
@@ -114,7 +114,7 @@ impl MapSaver {
                 Some(_) => {}
             }
         }
-        let head = self.numbering.head_on_disk(map_head(mapper));
+        let head = self.numbering.head_on_disk(head_of(mapper.map(), mapper.free_epoch()));
         let mut waiting = locked(&self.shared.waiting);
         while self.waits && (waiting.is_busy || waiting.head.is_some()) {
             waiting = self.shared.idle.wait(waiting).unwrap_or_else(PoisonError::into_inner);
@@ -159,7 +159,7 @@ impl MapSaver {
             }
             self.handed.insert(keyframe.keyframe_id, keyframe.revision);
         }
-        let head = self.numbering.head_on_disk(map_head(mapper));
+        let head = self.numbering.head_on_disk(head_of(mapper.map(), mapper.free_epoch()));
         writer.save(&self.camera, head)?;
         writer.settle()
     }
@@ -185,17 +185,6 @@ impl Drop for MapSaver {
             // A panic of the thread has been reported where it happened.
             drop(thread.join());
         }
-    }
-}
-
-/// The list of all keyframes.
-pub(super) fn map_head(mapper: &Mapper) -> MapHead {
-    let map = mapper.map();
-    MapHead {
-        keyframes: map.keyframes.iter().map(Keyframe::without_depth).collect(),
-        loops: map.loops.clone(),
-        revision: map.revision,
-        free_epoch: mapper.free_epoch(),
     }
 }
 

@@ -7,7 +7,6 @@ use crate::service::map_folder::map_folder_error::MapFolderError;
 use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::reading::Loaded;
 use crate::service::map_folder::write_new;
-use crate::service::map_folder::writer::MapHead;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 
@@ -27,13 +26,7 @@ pub fn merge(
         });
     }
     let map = joined(first.map, second.map);
-    let head = MapHead {
-        keyframes: map.keyframes.iter().map(Keyframe::without_depth).collect(),
-        loops: map.loops.clone(),
-        revision: map.revision,
-        free_epoch: map.free_epoch,
-    };
-    write_new(folder, &camera, first.manifest.detail, &map, head, &mut || ())?;
+    write_new(folder, &camera, first.manifest.detail, &map, map.free_epoch, &mut || ())?;
     Ok(map)
 }
 

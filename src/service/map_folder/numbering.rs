@@ -5,7 +5,6 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::service::map_folder::writer::MapHead;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::loops::record::LoopRecord;
 use crate::slam::map::Map;
@@ -61,15 +60,16 @@ impl Numbering {
     }
 
     /// The contents of a manifest in the numbers of the disk.
-    pub fn head_on_disk(&self, head: MapHead) -> MapHead {
+    pub fn head_on_disk(&self, head: Map) -> Map {
         if *self == Self::default() {
             return head;
         }
-        MapHead {
+        Map {
             keyframes: head.keyframes.into_iter().filter_map(|of| self.on_disk(of)).collect(),
             loops: Arc::new(head.loops.from(self.ids)),
             revision: head.revision.saturating_sub(self.revisions),
             free_epoch: head.free_epoch.saturating_sub(self.epochs),
+            ..head
         }
     }
 }
@@ -102,11 +102,10 @@ mod tests {
         let before = [keyframe(0, 0), keyframe(99, 6)];
         let loops = Arc::new(LoopRecord::default().with(&in_run.loops, 0).with(&map.loops, 0));
         assert_ne!(*loops, *in_run.loops);
-        let head = numbering.head_on_disk(MapHead {
+        let head = numbering.head_on_disk(Map {
             keyframes: before.into_iter().chain(in_run.keyframes).collect(),
             loops,
-            revision: in_run.revision,
-            free_epoch: in_run.free_epoch,
+            ..in_run
         });
         assert_eq!(head.keyframes, map.keyframes);
         assert_eq!((head.revision, head.free_epoch), (4, 3));

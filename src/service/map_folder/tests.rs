@@ -8,7 +8,7 @@ use super::*;
 use crate::service::config::MapConfig;
 use crate::service::map_folder::reading::{BEFORE, KEYFRAMES, MANIFEST, load};
 use crate::service::map_folder::session::first_own_id;
-use crate::service::map_folder::writer::{MapHead, MapWriter};
+use crate::service::map_folder::writer::MapWriter;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
@@ -41,9 +41,9 @@ fn keyframe(keyframe_id: u64, revision: u64) -> Keyframe {
     }
 }
 
-fn head(keyframes: &[Keyframe]) -> MapHead {
+fn head(keyframes: &[Keyframe]) -> Map {
     let keyframes = keyframes.iter().map(Keyframe::without_depth).collect();
-    MapHead { keyframes, revision: 6, free_epoch: 4, loops: Arc::default() }
+    Map { keyframes, revision: 6, free_epoch: 4, ..Map::default() }
 }
 
 /// Saves keyframes, all with their depth.

@@ -4,7 +4,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use crate::service::atomic_file::write_durably;
@@ -17,20 +16,18 @@ use crate::service::map_folder::reading::{
 use crate::service::results::output_lock::lock_output;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::loops::record::LoopRecord;
+use crate::slam::map::Map;
 use crate::wire::lock_file::{LockFile, Locking};
 
-/// The part of a map that its manifest holds.
-#[derive(Debug, Clone, Default)]
-pub struct MapHead {
-    /// Keyframes without image and points, ordered by id.
-    pub keyframes: Vec<Keyframe>,
-    /// Its loops.
-    pub loops: Arc<LoopRecord>,
-    /// Number of corrections of the map.
-    pub revision: u64,
-    /// First epoch number that is not in use.
-    pub free_epoch: u32,
+/// The part of a map that its manifest holds: keyframes without image and points, loops, and numbers.
+pub fn head_of(map: &Map, free_epoch: u32) -> Map {
+    Map {
+        keyframes: map.keyframes.iter().map(Keyframe::without_depth).collect(),
+        loops: map.loops.clone(),
+        revision: map.revision,
+        free_epoch,
+        ..Map::default()
+    }
 }
 
 /// A map folder that only this process writes.
@@ -134,9 +131,9 @@ impl MapWriter {
         Ok(())
     }
 
-    /// Writes the manifest, which makes this the map. Keyframes of another camera, those that contradicted themselves
+    /// Writes the manifest with a [`head_of`] a map, which makes this the map. Keyframes of another camera, those that contradicted themselves
     /// and those whose depth was never written are left out.
-    pub fn save(&mut self, camera: &Intrinsics, head: MapHead) -> Result<(), MapFolderError> {
+    pub fn save(&mut self, camera: &Intrinsics, head: Map) -> Result<(), MapFolderError> {
         let is_kept = |keyframe: &Keyframe| {
             keyframe.intrinsics == *camera && keyframe.map_state == MapState::Established
         };
