@@ -20,10 +20,9 @@ use semidense::service::map_file::parse_map;
 use semidense::service::map_folder::depth_file::{MapDetail, decode_into, encode, seal};
 use semidense::service::map_folder::manifest::Manifest;
 use semidense::service::pairing::Pairing;
-use semidense::service::recording::RecordParts;
+use semidense::service::results::record::RunRecord;
 use semidense::service::trajectory_file::{parse_trajectory, tum_line};
 use semidense::slam::alignment::reference::{Reference, ReferenceParams, ReferenceScratch};
-use semidense::slam::evaluation::depth_error::DepthScale;
 use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::rectification::Rectification;
@@ -290,16 +289,12 @@ pub fn journal(bytes: &[u8]) {
     assert!(map.keyframes.iter().all(|keyframe| keyframe.world_from_keyframe.is_valid()));
     let poses = found.recording.num_poses();
     assert!(found.counters.frames_in >= poses as u64);
-    let record = found.recording.into_record(RecordParts {
-        mode: found.start.mode,
-        source: found.start.source.to_string_lossy().into_owned(),
+    let known = RunRecord {
         map,
-        ground_truth: Vec::new(),
-        depth_scale: DepthScale::MedianRatio,
         is_depth_from_sensor: found.start.is_depth_from_sensor,
-        deadline_ms: 0.0,
-        counters: found.counters,
-    });
+        ..RunRecord::empty(found.start.mode, &found.start.source.to_string_lossy())
+    };
+    let record = found.recording.into_record(known, &found.counters, 0.0);
     assert_eq!(record.poses.len(), poses);
     let _ = Config::from_text(&found.start.config, "journal");
 }

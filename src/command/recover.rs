@@ -22,7 +22,6 @@ use crate::service::journal::Journal;
 use crate::service::journal::folder::{LOG, Unfinished, unfinished};
 use crate::service::journal::log::RunStart;
 use crate::service::journal::recovered::Recovered;
-use crate::service::recording::RecordParts;
 use crate::service::results::output_folder::{OutputFolder, PARENT, utc_text};
 use crate::service::results::record::{EndOfRun, RunRecord};
 use crate::service::results::set::has_set_since;
@@ -211,19 +210,16 @@ fn record_of(
 ) -> RunRecord {
     let start = &recovered.start;
     let depth_scale = if start.poses_given { DepthScale::Given } else { DepthScale::MedianRatio };
-    let parts = RecordParts {
-        mode: start.mode,
-        source: start.source.to_string_lossy().into_owned(),
+    let known = RunRecord {
+        ended: EndOfRun::Recovered(recovered.ended),
         map: recovered.map(folder, config.mapping.max_map_bytes() as u64),
+        first_keyframe_id: start.first_keyframe_id,
         ground_truth: source.ground_truth().to_vec(),
         depth_scale,
         is_depth_from_sensor: start.is_depth_from_sensor,
-        deadline_ms: config.tracker.deadline_ms,
-        counters: recovered.counters,
+        ..RunRecord::empty(start.mode, &start.source.to_string_lossy())
     };
-    let (ended, first_keyframe_id) = (recovered.ended, start.first_keyframe_id);
-    let record = recovered.recording.into_record(parts);
-    RunRecord { ended: EndOfRun::Recovered(ended), first_keyframe_id, ..record }
+    recovered.recording.into_record(known, &recovered.counters, config.tracker.deadline_ms)
 }
 
 /// A source that no longer exists, or never had ground truth.

@@ -7,7 +7,7 @@ use crate::service::journal::feed::KeyframeFeed;
 use crate::service::journal::log::{Record, Step};
 use crate::service::journal::recovered::complete;
 use crate::service::journal::{Journal, JournalOptions};
-use crate::service::recording::{RecordParts, Recording, RunCounters};
+use crate::service::recording::{Recording, RunCounters};
 use crate::service::results::record::RunRecord;
 use crate::slam::map::Map;
 use crate::wire::message::{AdjustmentMessage, PoseMessage, StepMessage};
@@ -149,9 +149,14 @@ impl Recorder {
     }
 
     /// The record of the whole run, after [`Recorder::read_back_poses`], and its complete journal.
-    pub fn into_record(mut self, parts: RecordParts) -> (RunRecord, Option<Journal>) {
-        self.count(parts.counters);
+    pub fn into_record(
+        mut self,
+        known: RunRecord,
+        counters: RunCounters,
+        deadline_ms: f64,
+    ) -> (RunRecord, Option<Journal>) {
+        self.count(counters);
         self.collect_keyframes(true);
-        (self.recording.into_record(parts), self.journal)
+        (self.recording.into_record(known, &counters, deadline_ms), self.journal)
     }
 }

@@ -6,9 +6,7 @@ use crate::service::adjustments::AdjustmentRecord;
 use crate::service::results::record::{RecordedPose, RunMode, RunRecord, StartTally};
 use crate::service::time_counts::TimeCounts;
 use crate::slam::evaluation::depth_error::DepthScale;
-use crate::slam::map::Map;
 use crate::slam::pose::TrackingState;
-use crate::slam::trajectory::StampedPose;
 use crate::wire::conversion::{MessageError, pose_from_message, start_frame_from_code};
 use crate::wire::message::PoseMessage;
 
@@ -64,27 +62,6 @@ pub struct Recording {
     start: StartTally,
     /// CLOCK_MONOTONIC of the first frame and of the last pose.
     span_nanos: Option<(i64, i64)>,
-}
-
-/// Parts of a record besides those collected.
-#[derive(Debug)]
-pub struct RecordParts {
-    /// How the run was driven.
-    pub mode: RunMode,
-    /// Source of the frames.
-    pub source: String,
-    /// The map at the end.
-    pub map: Map,
-    /// True poses.
-    pub ground_truth: Vec<StampedPose>,
-    /// Source of the metric scale when depth is compared.
-    pub depth_scale: DepthScale,
-    /// Whether keyframes took their first depth from the source's depth camera.
-    pub is_depth_from_sensor: bool,
-    /// The tracker's configured deadline, milliseconds.
-    pub deadline_ms: f64,
-    /// The counters.
-    pub counters: RunCounters,
 }
 
 impl Recording {
@@ -155,26 +132,28 @@ impl Recording {
         self.map_nanos.len()
     }
 
-    /// The record of the whole run, once all released poses have been taken back.
-    pub fn into_record(mut self, parts: RecordParts) -> RunRecord {
-        let counters = &parts.counters;
+    /// The record of the whole run, once all released poses have been taken back. `known` has what is not collected;
+    /// `deadline_ms` is the tracker's configured deadline.
+    pub fn into_record(
+        mut self,
+        known: RunRecord,
+        counters: &RunCounters,
+        deadline_ms: f64,
+    ) -> RunRecord {
         let stamps = |pose: Option<&RecordedPose>| pose.map_or(0, |p| p.estimate.capture_nanos);
         let (first, last) = (stamps(self.poses.first()), stamps(self.poses.last()));
         let positive = |nanos: i64| u64::try_from(nanos).unwrap_or(0);
         let recorded_nanos = positive(last.saturating_sub(first));
         let period_nanos = recorded_nanos / counters.frames_in.saturating_sub(1).max(1);
-        let deadline_nanos = if parts.deadline_ms > 0.0 {
-            (parts.deadline_ms * 1e6) as u64
-        } else {
-            period_nanos / 2
-        };
-        let (is_live, is_replay) = (parts.mode == RunMode::Live, parts.mode == RunMode::Replay);
+        let deadline_nanos =
+            if deadline_ms > 0.0 { (deadline_ms * 1e6) as u64 } else { period_nanos / 2 };
+        let (is_live, is_replay) = (known.mode == RunMode::Live, known.mode == RunMode::Replay);
         let wall_nanos = self.span_nanos.map_or(0, |(first, last)| last.saturating_sub(first));
         if is_replay {
             // A single process sends nothing.
             self.poses.iter_mut().for_each(|p| (p.latency_nanos, p.wake_nanos) = (None, None));
         }
-        if parts.depth_scale == DepthScale::Given {
+        if known.depth_scale == DepthScale::Given {
             self.poses.iter_mut().for_each(|pose| pose.track_nanos = None);
         }
         let skipped = self.poses.len().saturating_sub(self.map_nanos.len());
@@ -184,10 +163,6 @@ impl Recording {
             brightened_by: counters.brightened_by,
             frames_dropped: counters.frames_in.saturating_sub(self.poses.len() as u64),
             poses: self.poses,
-            map: parts.map,
-            ground_truth: parts.ground_truth,
-            depth_scale: parts.depth_scale,
-            is_depth_from_sensor: parts.is_depth_from_sensor,
             gaps: counters.gaps,
             restarts: counters.restarts,
             frames_skipped_by_mapper: (!is_replay).then_some(skipped as u64),
@@ -203,7 +178,7 @@ impl Recording {
             recorded_nanos,
             wall_nanos: positive(wall_nanos),
             peak_rss_bytes: (counters.peak_rss_bytes > 0).then_some(counters.peak_rss_bytes),
-            ..RunRecord::empty(parts.mode, &parts.source)
+            ..known
         }
     }
 }
@@ -248,17 +223,9 @@ mod tests {
     #[test]
     fn only_a_live_run_has_a_deadline_and_page_faults_that_may_cost_it() {
         let record = |mode| {
-            let parts = RecordParts {
-                mode,
-                source: "x".to_owned(),
-                map: Map::default(),
-                ground_truth: Vec::new(),
-                depth_scale: DepthScale::default(),
-                is_depth_from_sensor: false,
-                deadline_ms: 5.0,
-                counters: RunCounters { page_faults: 3, ..RunCounters::default() },
-            };
-            let record = Recording::default().into_record(parts);
+            let counters = RunCounters { page_faults: 3, ..RunCounters::default() };
+            let known = RunRecord::empty(mode, "x");
+            let record = Recording::default().into_record(known, &counters, 5.0);
             (record.page_faults, record.deadline_nanos)
         };
         assert_eq!(record(RunMode::Live), (Some(3), Some(5_000_000)));

@@ -23,7 +23,7 @@ use crate::service::mode::Mode;
 use crate::service::peers::Peer;
 use crate::service::position::{position_key, read_position};
 use crate::service::recorder::Recorder;
-use crate::service::recording::{RecordParts, RunCounters};
+use crate::service::recording::RunCounters;
 use crate::service::results::record::{EndOfRun, RestartCause, RunMode, RunRecord};
 pub use crate::service::run_error::RunError;
 use crate::service::run_progress::RunProgress;
@@ -31,7 +31,6 @@ use crate::service::schedule::peak_rss_bytes;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervised::{Death, Supervised};
 use crate::service::time_counts::TimeCounts;
-use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::map::Map;
 use crate::wire::command::CommandClient;
 use crate::wire::place::{Claim, Place};
@@ -147,21 +146,20 @@ fn supervise(
     if options.mode == Mode::Lockstep && ended == EndOfRun::Finished && lost > 0 {
         ended = EndOfRun::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));
     }
-    let (record, journal) = recorder.into_record(RecordParts {
-        mode: if options.mode == Mode::Live { RunMode::Live } else { RunMode::Lockstep },
-        source: options.source.to_string(),
-        map,
-        ground_truth: source.ground_truth().to_vec(),
-        depth_scale: DepthScale::MedianRatio,
-        is_depth_from_sensor: false,
-        deadline_ms: config.tracker.deadline_ms,
-        counters,
-    });
     let loaded_map = loaded_map(place);
     let of_start = options.journal.as_ref().map_or(0, |kept| kept.start.first_keyframe_id);
-    let first_keyframe_id = loaded_map.as_ref().map_or(of_start, |map| map.first_keyframe_id);
-    let record =
-        RunRecord { ended, refused, restart_causes, loaded_map, first_keyframe_id, ..record };
+    let mode = if options.mode == Mode::Live { RunMode::Live } else { RunMode::Lockstep };
+    let known = RunRecord {
+        ended,
+        refused,
+        restart_causes,
+        map,
+        first_keyframe_id: loaded_map.as_ref().map_or(of_start, |map| map.first_keyframe_id),
+        loaded_map,
+        ground_truth: source.ground_truth().to_vec(),
+        ..RunRecord::empty(mode, &options.source.to_string())
+    };
+    let (record, journal) = recorder.into_record(known, counters, config.tracker.deadline_ms);
     Ok(RunOutcome { record, journal, source })
 }
 

@@ -199,10 +199,9 @@ fn advice(seen: StartFrame) -> &'static str {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::service::recording::{RecordParts, Recording, RunCounters};
+    use crate::service::recording::{Recording, RunCounters};
     use crate::service::results::record::RunMode;
     use crate::slam::frame::FrameView;
-    use crate::slam::map::Map;
     use crate::slam::pose::PoseEstimate;
     use crate::wire::conversion::{PoseTiming, pose_message};
 
@@ -231,16 +230,8 @@ pub(super) mod tests {
         }
         const UNMATCHED: u32 = 5;
         (0..handled).for_each(|_| recording.add_step(40_000_000, 0, UNMATCHED));
-        recording.into_record(RecordParts {
-            mode: RunMode::Live,
-            source: "x".to_owned(),
-            map: Map::default(),
-            ground_truth: Vec::new(),
-            depth_scale: DepthScale::MedianRatio,
-            is_depth_from_sensor: false,
-            deadline_ms: 0.0,
-            counters: RunCounters { frames_in: frames, ..RunCounters::default() },
-        })
+        let counters = RunCounters { frames_in: frames, ..RunCounters::default() };
+        recording.into_record(RunRecord::empty(RunMode::Live, "x"), &counters, 0.0)
     }
 
     #[test]
