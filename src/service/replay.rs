@@ -353,7 +353,8 @@ impl<'a> Replay<'a> {
         if let Situation::Rejected(contradiction) = self.mapper.situation()
             && !was_rejected
         {
-            let rejection = Rejection { sequence: frame.sequence, contradiction };
+            let (sequence, reason) = (frame.sequence, contradiction.to_string());
+            let rejection = Rejection { sequence, reason };
             self.record.rejections.get_or_insert_default().push(rejection);
         }
         self.adjust(frame.sequence, &mut outcome);

@@ -107,7 +107,8 @@ fn figures_and_files_of_a_run_with_truth_and_a_loss() {
     };
     let poses = (0..60).map(|i| pose(i, state(i), u64::from(i >= 40))).collect();
     let contradiction = Contradiction::ScaleJump;
-    let rejections = Some(vec![Rejection { sequence: 20, contradiction }]);
+    let reason = contradiction.to_string();
+    let rejections = Some(vec![Rejection { sequence: 20, reason }]);
     let record = record(poses, vec![keyframe(0), keyframe(1)], true);
     let record = RunRecord { rejections, ..record };
     let folder = tempfile::tempdir().unwrap();

@@ -12,7 +12,6 @@ use crate::service::time_counts::TimeCounts;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
-use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::mapper::situation::StartFrame;
 use crate::slam::pose::PoseEstimate;
 use crate::slam::trajectory::StampedPose;
@@ -59,12 +58,12 @@ impl StartTally {
 }
 
 /// A contradiction found in the map.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Rejection {
     /// Sequence of the frame that revealed it.
     pub sequence: u64,
-    /// The contradiction.
-    pub contradiction: Contradiction,
+    /// The contradiction, in words.
+    pub reason: String,
 }
 
 /// How a run ended.

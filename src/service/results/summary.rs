@@ -234,7 +234,7 @@ pub struct Summary {
     /// How often tracking was lost.
     pub lost_count: u64,
     /// Each time the map was found to contradict itself: the frame, and why. Replay only.
-    pub map_rejections: Option<Vec<RejectionSummary>>,
+    pub map_rejections: Option<Vec<Rejection>>,
     /// Median over the tracked frames of residuals over their standard deviation: 1 where everything is as modelled,
     /// above 1.5 the calibration is doubted; null for fewer than 30 frames.
     pub whitened_residual_median: Option<f64>,
@@ -313,15 +313,6 @@ pub struct Summary {
     pub depth: DepthSummary,
 }
 
-/// A contradiction found in the map.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RejectionSummary {
-    /// Sequence of the frame that revealed it.
-    pub sequence: u64,
-    /// The contradiction, in words.
-    pub reason: String,
-}
-
 /// 2²⁰.
 const BYTES_PER_MB: f64 = 1_048_576.0;
 
@@ -358,7 +349,7 @@ impl Summary {
             frames_dropped: record.frames_dropped,
             gaps: record.gaps,
             lost_count: count_losses(&record.poses),
-            map_rejections: record.rejections.as_deref().map(rejections),
+            map_rejections: record.rejections.clone(),
             whitened_residual_median: whitened_residual_median(&record.poses),
             initialization_secs: initialization_secs(&record.poses),
             untracked: Untracked::of(record).map(|why| why.to_string()),
@@ -393,14 +384,6 @@ impl Summary {
             depth: depth.into(),
         }
     }
-}
-
-fn rejections(all: &[Rejection]) -> Vec<RejectionSummary> {
-    let in_words = |&Rejection { sequence, contradiction }: &Rejection| RejectionSummary {
-        sequence,
-        reason: contradiction.to_string(),
-    };
-    all.iter().map(in_words).collect()
 }
 
 /// How a run ended in a word, what failed, and when a recovered run ended.

@@ -4,9 +4,8 @@ use std::fmt::Write;
 
 use crate::service::results::joint::JointSummary;
 use crate::service::results::loops::LoopSummary;
-use crate::service::results::summary::{
-    DepthSummary, RejectionSummary, Summary, TrajectorySummary,
-};
+use crate::service::results::record::Rejection;
+use crate::service::results::summary::{DepthSummary, Summary, TrajectorySummary};
 use crate::service::results::times::Percentiles;
 use crate::slam::counted::counted;
 use crate::slam::evaluation::grade::Grade;
@@ -25,7 +24,7 @@ pub fn summary_text(summary: &Summary) -> String {
     let restarts = summary.restart_causes.iter();
     lines.add("restarts", restarts.map(|of| format!("{} {}: {}", of.count, of.process, of.cause)));
     let rejections = summary.map_rejections.iter().flatten();
-    let rejected = |of: &RejectionSummary| format!("map at frame {}: {}", of.sequence, of.reason);
+    let rejected = |of: &Rejection| format!("map at frame {}: {}", of.sequence, of.reason);
     lines.add("rejected", rejections.map(rejected));
     lines.add("errors", evaluated(summary));
     lines.add("trajectory", trajectory_errors(&summary.trajectory));

@@ -194,7 +194,7 @@ fn all_words() -> impl Iterator<Item = &'static Words> {
 mod tests {
     use super::*;
     use crate::service::results::alignment_levels::LevelSummary;
-    use crate::service::results::summary::{PointCounts, RejectionSummary};
+    use crate::service::results::summary::PointCounts;
     use crate::service::results::times::{Histogram, Percentiles};
     use crate::service::results::untracked::tests::record;
     use crate::slam::evaluation::depth_error::DepthErrors;
@@ -250,7 +250,8 @@ mod tests {
             iterations_mean: 1.0,
             nanos_per_point: None,
         };
-        let rejection = RejectionSummary { sequence: 0, reason: String::new() };
+        let rejection =
+            crate::service::results::record::Rejection { sequence: 0, reason: String::new() };
         let cause = crate::service::results::record::RestartCause {
             process: String::new(),
             cause: String::new(),
