@@ -292,7 +292,7 @@ pub fn journal(bytes: &[u8]) {
     let known = RunRecord {
         map,
         is_depth_from_sensor: found.start.is_depth_from_sensor,
-        ..RunRecord::empty(found.start.mode, &found.start.source.to_string_lossy())
+        ..RunRecord::empty(found.start.mode, &found.start.source.to_os_string().to_string_lossy())
     };
     let record = found.recording.into_record(known, &found.counters, 0.0);
     assert_eq!(record.poses.len(), poses);

@@ -228,9 +228,9 @@ pub fn journal_options(
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
     let start = RunStart {
         mode: RunMode::Replay,
-        source: source.to_os_string(),
-        rig: rig.map(|rig| rig.as_os_str().to_owned()),
-        folder: folder.into_os_string(),
+        source: source.to_os_string().into(),
+        rig: rig.map(Into::into),
+        folder: folder.into(),
         config: config.to_text(),
         poses_given: false,
         is_depth_from_sensor: false,

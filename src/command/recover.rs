@@ -19,6 +19,7 @@ use crate::command::print::note;
 use crate::command::{CommandResult, NOTHING_TRACKED};
 use crate::service::config::Config;
 use crate::service::journal::Journal;
+use crate::service::journal::any_bytes::AnyBytes;
 use crate::service::journal::folder::{LOG, Unfinished, unfinished};
 use crate::service::journal::log::RunStart;
 use crate::service::journal::recovered::Recovered;
@@ -186,14 +187,16 @@ fn find(place: &Place, folder: Option<&Path>) -> Result<Unfinished, Box<dyn Erro
 /// Reopens the source of the run for its true poses and depth; a source without truth if it cannot be opened.
 fn source_of(start: &RunStart, config: &Config) -> Box<dyn FrameSource> {
     let opened = || -> Result<Box<dyn FrameSource>, Box<dyn Error>> {
-        let name = SourceName::parse(&start.source)?;
+        let name = SourceName::parse(&start.source.to_os_string())?;
         if name.is_camera() {
             return Ok(Box::new(NoSource));
         }
         // Its paths are relative to where the run was started.
-        std::env::set_current_dir(&start.folder)
-            .map_err(|error| format!("{}: {error}", start.folder.display()))?;
-        Ok(open(&name, start.rig.as_deref().map(Path::new), &config.source_params())?)
+        let folder = start.folder.to_os_string();
+        std::env::set_current_dir(&folder)
+            .map_err(|error| format!("{}: {error}", folder.display()))?;
+        let rig = start.rig.as_ref().map(AnyBytes::to_os_string);
+        Ok(open(&name, rig.as_deref().map(Path::new), &config.source_params())?)
     };
     opened().unwrap_or_else(|error| {
         note(&format!("no comparison with ground truth: the source cannot be opened ({error})"));
@@ -217,7 +220,7 @@ fn record_of(
         ground_truth: source.ground_truth().to_vec(),
         depth_scale,
         is_depth_from_sensor: start.is_depth_from_sensor,
-        ..RunRecord::empty(start.mode, &start.source.to_string_lossy())
+        ..RunRecord::empty(start.mode, &start.source.to_os_string().to_string_lossy())
     };
     recovered.recording.into_record(known, &recovered.counters, config.tracker.deadline_ms)
 }

@@ -5,7 +5,7 @@
 //! is removed once the results are written; one that no process holds belongs to a run that was killed, and
 //! [`recovered`] makes its record.
 
-mod any_bytes;
+pub(crate) mod any_bytes;
 pub(crate) mod feed;
 pub mod folder;
 pub mod log;

@@ -1,57 +1,33 @@
 //! Paths in JSON: text where they are text, else their bytes.
 
-use std::ffi::OsString;
-use std::os::unix::ffi::{OsStrExt, OsStringExt};
+use std::ffi::{OsStr, OsString};
+use std::os::unix::ffi::OsStringExt;
 
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Serialize};
 
-#[derive(Serialize, Deserialize)]
+/// A path, or a name with one in it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
-enum Path {
+pub enum AnyBytes {
+    /// It is text.
     Text(String),
+    /// It is not.
     Bytes(Vec<u8>),
 }
 
-impl From<&OsString> for Path {
-    fn from(path: &OsString) -> Self {
-        match path.to_str() {
-            Some(text) => Self::Text(text.to_owned()),
-            None => Self::Bytes(path.as_bytes().to_vec()),
+impl<T: AsRef<OsStr>> From<T> for AnyBytes {
+    fn from(path: T) -> Self {
+        let text = path.as_ref().to_owned().into_string();
+        text.map_or_else(|path| Self::Bytes(path.into_vec()), Self::Text)
+    }
+}
+
+impl AnyBytes {
+    /// The path itself.
+    pub fn to_os_string(&self) -> OsString {
+        match self {
+            Self::Text(text) => text.into(),
+            Self::Bytes(bytes) => OsString::from_vec(bytes.clone()),
         }
-    }
-}
-
-impl From<Path> for OsString {
-    fn from(path: Path) -> Self {
-        match path {
-            Path::Text(text) => text.into(),
-            Path::Bytes(bytes) => Self::from_vec(bytes),
-        }
-    }
-}
-
-pub(super) fn serialize<S: Serializer>(path: &OsString, to: S) -> Result<S::Ok, S::Error> {
-    Path::from(path).serialize(to)
-}
-
-pub(super) fn deserialize<'a, D: Deserializer<'a>>(from: D) -> Result<OsString, D::Error> {
-    Path::deserialize(from).map(OsString::from)
-}
-
-/// The same for an optional path.
-pub(super) mod optional {
-    use super::{Deserialize, Deserializer, OsString, Path, Serialize, Serializer};
-
-    pub(in super::super) fn serialize<S: Serializer>(
-        path: &Option<OsString>,
-        to: S,
-    ) -> Result<S::Ok, S::Error> {
-        path.as_ref().map(Path::from).serialize(to)
-    }
-
-    pub(in super::super) fn deserialize<'a, D: Deserializer<'a>>(
-        from: D,
-    ) -> Result<Option<OsString>, D::Error> {
-        Ok(Option::<Path>::deserialize(from)?.map(OsString::from))
     }
 }

@@ -4,7 +4,6 @@
 //! A dying process tears at most the last record: reading ends at the first incomplete record, and those before it
 //! count.
 
-use std::ffi::OsString;
 use std::io::Read;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -12,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use zerocopy::{FromBytes, IntoBytes};
 
 use crate::service::bytes::take;
-use crate::service::journal::any_bytes;
+use crate::service::journal::any_bytes::AnyBytes;
 use crate::service::map_file::{keyframe_bytes, parse_keyframe};
 use crate::service::recording::RunCounters;
 use crate::service::results::record::RunMode;
@@ -35,14 +34,11 @@ pub struct RunStart {
     /// How it is driven.
     pub mode: RunMode,
     /// Source of the frames; a path in it may have any bytes.
-    #[serde(with = "any_bytes")]
-    pub source: OsString,
+    pub source: AnyBytes,
     /// The camera's rig file.
-    #[serde(with = "any_bytes::optional")]
-    pub rig: Option<OsString>,
+    pub rig: Option<AnyBytes>,
     /// The folder that relative paths refer to.
-    #[serde(with = "any_bytes")]
-    pub folder: OsString,
+    pub folder: AnyBytes,
     /// The whole configuration, as TOML.
     pub config: String,
     /// Whether poses were given rather than estimated.
@@ -232,6 +228,7 @@ pub fn read_log(log: impl Read, take: &mut dyn FnMut(Record)) -> LogEnd {
 
 #[cfg(test)]
 mod tests {
+    use std::ffi::OsString;
     use std::os::unix::ffi::OsStringExt;
 
     use super::*;
@@ -245,7 +242,7 @@ mod tests {
     fn records() -> Vec<Record> {
         let start = RunStart {
             mode: RunMode::Live,
-            source: OsString::from_vec(b"tum:a \"b\"\n\xff".to_vec()),
+            source: OsString::from_vec(b"tum:a \"b\"\n\xff".to_vec()).into(),
             rig: None,
             folder: "/x".into(),
             config: "instance = \"x\"\n".into(),
