@@ -175,7 +175,7 @@ impl Drop for Checkpoint {
 
 /// The file holds images: readable only by the user of the process.
 fn write_or_warn(path: &Path, map: &Map) {
-    if let Err(error) = write_privately(path, |file| write_map_into(file, map)) {
+    if let Err(error) = write_privately(path, |file| write_map_into(file, map, &mut || ())) {
         tracing::warn!(
             "{}: cannot write the checkpoint ({error}); a restarted mapper would start a new map",
             path.display()

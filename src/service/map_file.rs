@@ -98,29 +98,21 @@ pub enum MapFault {
 /// Writes `map` under a temporary name and renames it to `path`. Calls `each` before each keyframe: a large map on a
 /// slow disk takes longer than a process may be silent.
 pub fn write_map(path: &Path, map: &Map, each: &mut dyn FnMut()) -> io::Result<()> {
-    write_atomically(path, |file| {
-        write_head(file, map)?;
-        map.keyframes.iter().try_for_each(|keyframe| {
-            each();
-            write_keyframe(file, keyframe)
-        })?;
-        each();
-        write_rest(file, map)
-    })
+    write_atomically(path, |file| write_map_into(file, map, each))
 }
 
-/// Writes the bytes of `map`.
-pub fn write_map_into(file: &mut impl Write, map: &Map) -> io::Result<()> {
-    write_head(file, map)?;
-    map.keyframes.iter().try_for_each(|keyframe| write_keyframe(file, keyframe))?;
-    write_rest(file, map)
-}
-
-fn write_head(file: &mut impl Write, map: &Map) -> io::Result<()> {
+/// Writes the bytes of `map`. Calls `each` before each keyframe and before what follows them.
+pub fn write_map_into(file: &mut impl Write, map: &Map, each: &mut dyn FnMut()) -> io::Result<()> {
     file.write_all(&MAGIC)?;
     file.write_all(map.free_epoch.as_bytes())?;
     let active = map.active.unwrap_or(NO_KEYFRAME);
-    file.write_all([map.revision, active, map.keyframes.len() as u64].as_bytes())
+    file.write_all([map.revision, active, map.keyframes.len() as u64].as_bytes())?;
+    for keyframe in &map.keyframes {
+        each();
+        write_keyframe(file, keyframe)?;
+    }
+    each();
+    write_rest(file, map)
 }
 
 fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> {

@@ -199,7 +199,8 @@ impl Writer {
         let path = self.folder.join(keyframe_file(&keyframe));
         let temporary = path.with_extension("tmp");
         let mut bytes = Vec::new();
-        write_map_into(&mut bytes, &Map { keyframes: vec![keyframe], ..Map::default() })?;
+        let map = Map { keyframes: vec![keyframe], ..Map::default() };
+        write_map_into(&mut bytes, &map, &mut || ())?;
         let written = File::create(&temporary).and_then(|mut file| {
             file.write_all(&bytes)?;
             file.sync_data()
