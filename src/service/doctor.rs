@@ -9,7 +9,8 @@ use std::path::PathBuf;
 use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
 
-use self::cameras::{CameraAccess, camera_access};
+use self::cameras::CameraAccess;
+use crate::capture::v4l::listing::access;
 use crate::service::config::Config;
 use crate::service::schedule::Policy;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -74,7 +75,7 @@ pub struct Machine {
 
 impl Default for Machine {
     fn default() -> Self {
-        Self { root: PathBuf::from("/"), camera_access }
+        Self { root: PathBuf::from("/"), camera_access: access }
     }
 }
 

@@ -100,12 +100,7 @@ impl Machine {
     }
 }
 
-/// Whether a camera can be used; `None` for a node that is not a camera.
-pub(super) fn camera_access(path: &Path) -> Option<Access> {
-    crate::capture::v4l::listing::access(path)
-}
-
-/// Checks a node; a test can replace it.
+/// Whether a camera can be used, `None` for a node that is not a camera; a test can replace it.
 pub(super) type CameraAccess = fn(&Path) -> Option<Access>;
 
 #[cfg(test)]
