@@ -178,7 +178,7 @@ impl Adjustments {
             }
         }
         self.begin_with(mapper, true, Mapper::begin_last_adjustment);
-        outcome = merged_outcome(outcome, self.apply_within(mapper, left()));
+        outcome = merged_outcome(outcome, self.take_in(mapper, left()).1);
         while !left().is_zero() && mapper.refine_depth() {
             outcome.graph_changed = true;
         }
@@ -228,11 +228,6 @@ impl Adjustments {
             (Entry::AfterFrames(_), _) => Duration::MAX,
             (Entry::WhenReady, _) => Duration::ZERO,
         };
-        self.apply_within(mapper, timeout)
-    }
-
-    /// Lets in the estimate in flight if it comes back within `timeout`.
-    fn apply_within(&mut self, mapper: &mut Mapper, timeout: Duration) -> StepOutcome {
         self.take_in(mapper, timeout).1
     }
 
