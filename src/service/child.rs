@@ -102,8 +102,6 @@ pub fn tidy_up(place: &Place) {
 /// A running child. Killed when dropped while it still runs.
 #[derive(Debug)]
 pub struct Child {
-    /// Its name: the subcommand.
-    pub name: &'static str,
     process: std::process::Child,
     started: Instant,
     fault: Arc<Mutex<Option<String>>>,
@@ -114,7 +112,7 @@ impl Child {
     /// Starts the subcommand `name` of this binary. `run` names the run it belongs to; `frames` holds the frames that
     /// it prepares; its log goes to `log`.
     pub fn start(
-        name: &'static str,
+        name: &str,
         arguments: &[OsString],
         root: &Path,
         run: &str,
@@ -139,7 +137,7 @@ impl Child {
         let log_name = format!("semidense-{name}-log");
         let reader = process.stderr.take().map(|stderr| forward_lines(&log_name, stderr, take));
         let reader = reader.transpose()?;
-        Ok(Self { name, process, started: Instant::now(), fault, reader })
+        Ok(Self { process, started: Instant::now(), fault, reader })
     }
 
     /// Its process id.
