@@ -42,9 +42,8 @@ use tracing_subscriber::prelude::*;
 
 use crate::capture::source_error::SourceError;
 use crate::command::print::{PrintError, note};
-use crate::service::child::tidy_up;
-use crate::service::child::{ERROR_PREFIX, follow_supervisor};
-use crate::service::config::{Config, ConfigError, SYSTEM_FOLDER, file_for};
+use crate::service::child::{ERROR_PREFIX, follow_supervisor, tidy_up};
+use crate::service::config::{Config, SYSTEM_FOLDER, file_for};
 use crate::service::error_log::ErrorLog;
 use crate::wire::limits::check_address_space;
 use crate::wire::place::Place;
@@ -115,11 +114,6 @@ pub enum LogFormat {
 }
 
 impl CommonArguments {
-    /// Loads the configuration, including the settings on the command line.
-    fn load(&self) -> Result<Config, ConfigError> {
-        Config::load(self.file().as_deref(), &self.settings())
-    }
-
     /// Settings on the command line, in the form of `--set`.
     fn settings(&self) -> Vec<String> {
         let named = self.instance.iter().map(|name| format!("instance={name:?}"));
@@ -298,7 +292,7 @@ fn prepare(common: &CommonArguments, log: &ErrorLog) -> Result<Config, Box<dyn E
     follow_supervisor()?;
     check_address_space(0)?;
     start_log(log_filter(&common.log)?, common.log_format, log)?;
-    let config = common.load()?;
+    let config = Config::load(common.file().as_deref(), &common.settings())?;
     tracing::info!("configuration:\n{}", config.to_text());
     Ok(config)
 }
