@@ -40,6 +40,11 @@ pub fn duration_from_nanos(nanos: i64) -> Duration {
     Duration::from_nanos(u64::try_from(nanos).unwrap_or(0))
 }
 
+/// Nanoseconds since `begin`.
+pub fn elapsed_nanos(begin: Instant) -> u64 {
+    u64::try_from(begin.elapsed().as_nanos()).unwrap_or(u64::MAX)
+}
+
 /// Polls `is_over` until it holds or `longest` has passed; returns whether it holds.
 pub fn wait_at_most(longest: Duration, mut is_over: impl FnMut() -> bool) -> bool {
     /// Pause between two polls.

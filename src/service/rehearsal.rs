@@ -2,6 +2,7 @@
 
 use std::time::Instant;
 
+use crate::service::clock::elapsed_nanos;
 use crate::service::results::budget_curve::{BudgetSample, BudgetStep, is_tried};
 use crate::slam::alignment::displacement::mean_displacement_px;
 use crate::slam::frame::FrameView;
@@ -83,8 +84,4 @@ fn rehearse(tracker: &mut Tracker, memory: &Memory, frame: &FrameView<'_>) -> Op
     let last = BudgetStep { iterations: needed, nanos, displacement_px: 0.0 };
     // A frame that is cut short is evaluated once more on the finest level: less may take longer than more.
     Some(attempts.into_iter().map(step).chain([last]).collect())
-}
-
-fn elapsed_nanos(begin: Instant) -> u64 {
-    u64::try_from(begin.elapsed().as_nanos()).unwrap_or(u64::MAX)
 }

@@ -15,6 +15,7 @@ use crate::capture::source_error::SourceError;
 use crate::service::adjustments::{Adjustments, Entry};
 use crate::service::alignment_stamps::AlignmentStamps;
 use crate::service::brighten::Brightened;
+use crate::service::clock::elapsed_nanos;
 use crate::service::config::MapConfig;
 use crate::service::given_pose::{given_pose, truth_in_first_camera};
 use crate::service::map_folder::session::{MapSession, MapSessionError};
@@ -488,8 +489,4 @@ impl<'a> Replay<'a> {
         record.peak_rss_bytes = peak_rss_bytes();
         Ok((record, saved))
     }
-}
-
-fn elapsed_nanos(begin: Instant) -> u64 {
-    u64::try_from(begin.elapsed().as_nanos()).unwrap_or(u64::MAX)
 }
