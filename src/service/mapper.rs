@@ -237,10 +237,9 @@ impl<'a> Shell<'a> {
     /// Live: reports when frames have stopped. The next step ends the state.
     fn check_for_silence(&mut self) -> Result<(), ReceiveError> {
         // Its last message is received only by those that have listened before it ends.
-        self.capture.update()?;
+        let (state, cause) = self.capture.state_in_silence()?;
         let periods = self.config.tracker.stale_periods;
         if self.mode == Mode::Live && self.order.is_silent(self.last_arrival_nanos, periods) {
-            let (state, cause) = self.capture.state_in_silence()?;
             self.health.enter(state, cause);
         }
         Ok(())
