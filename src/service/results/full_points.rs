@@ -3,6 +3,8 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use zerocopy::IntoBytes;
+
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::pictures::is_known;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
@@ -45,11 +47,9 @@ pub fn write_full_points(path: &Path, map: &Map, max_relative_std_dev: f64) -> i
              end_header\n"
         )?;
         points(map, max_relative_std_dev).try_for_each(|(keyframe, point)| {
-            let position = in_map(keyframe, [point.u, point.v], point.inverse_depth);
-            for number in position.iter().chain([&point.intensity, &point.variance]) {
-                file.write_all(&number.to_le_bytes())?;
-            }
-            file.write_all(&(keyframe.keyframe_id as u32).to_le_bytes())
+            let [x, y, z] = in_map(keyframe, [point.u, point.v], point.inverse_depth);
+            file.write_all([x, y, z, point.intensity, point.variance].as_bytes())?;
+            file.write_all((keyframe.keyframe_id as u32).as_bytes())
         })
     })
 }

@@ -4,6 +4,8 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use zerocopy::IntoBytes;
+
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::full_points::in_map;
 use crate::slam::map::{ConfirmedPoint, Map};
@@ -23,12 +25,9 @@ pub fn write_points(path: &Path, map: &Map) -> io::Result<()> {
              end_header\n",
             points.len()
         )?;
-        points.iter().try_for_each(|(position, point)| {
-            for number in position.iter().chain([&point.intensity]) {
-                file.write_all(&number.to_le_bytes())?;
-            }
-            file.write_all(&point.confirmations.to_le_bytes())?;
-            file.write_all(&(point.keyframe_id as u32).to_le_bytes())
+        points.iter().try_for_each(|([x, y, z], point)| {
+            file.write_all([*x, *y, *z, point.intensity].as_bytes())?;
+            file.write_all([point.confirmations, point.keyframe_id as u32].as_bytes())
         })
     })
 }

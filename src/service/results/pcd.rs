@@ -3,6 +3,8 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use zerocopy::IntoBytes;
+
 use crate::service::atomic_file::write_atomically;
 use crate::slam::fusion::SurfacePoint;
 
@@ -28,12 +30,10 @@ pub fn write_pcd(path: &Path, surface: &[SurfacePoint]) -> io::Result<()> {
             count = surface.len()
         )?;
         surface.iter().try_for_each(|point| {
-            for number in point.position.iter().chain(&point.normal) {
-                file.write_all(&number.to_le_bytes())?;
-            }
+            file.write_all([point.position, point.normal].as_bytes())?;
             // PCL packs blue, green and red into the bytes of a number.
             file.write_all(&[point.grey, point.grey, point.grey, 0])?;
-            file.write_all(&point.sigma.to_le_bytes())?;
+            file.write_all(point.sigma.as_bytes())?;
             file.write_all(&[point.keyframes])
         })
     })

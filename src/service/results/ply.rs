@@ -4,7 +4,10 @@ use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 
+use zerocopy::IntoBytes;
+
 use crate::service::atomic_file::write_atomically;
+use crate::service::bytes::take;
 use crate::slam::fusion::SurfacePoint;
 
 /// Bytes of a point of the surface in the file.
@@ -29,7 +32,12 @@ pub fn write_surface(path: &Path, surface: &[SurfacePoint]) -> io::Result<()> {
              element vertex {}\n{PROPERTIES}",
             surface.len()
         )?;
-        surface.iter().try_for_each(|point| file.write_all(&bytes_of(point)))
+        surface.iter().try_for_each(|point| {
+            file.write_all([point.position, point.normal].as_bytes())?;
+            file.write_all(&[point.grey; 3])?;
+            file.write_all(point.sigma.as_bytes())?;
+            file.write_all(&[point.keyframes])
+        })
     })
 }
 
@@ -82,27 +90,11 @@ fn read_header(file: &mut impl BufRead) -> io::Result<Option<usize>> {
     Ok(count)
 }
 
-fn bytes_of(point: &SurfacePoint) -> [u8; SURFACE_POINT_BYTES] {
-    let mut bytes = [0; SURFACE_POINT_BYTES];
-    for (i, number) in point.position.iter().chain(&point.normal).enumerate() {
-        bytes[4 * i..][..4].copy_from_slice(&number.to_le_bytes());
-    }
-    bytes[24..27].fill(point.grey);
-    bytes[27..31].copy_from_slice(&point.sigma.to_le_bytes());
-    bytes[31] = point.keyframes;
-    bytes
-}
-
-fn point_of(bytes: &[u8; SURFACE_POINT_BYTES]) -> Option<SurfacePoint> {
-    let number =
-        |at: usize| f32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
-    let point = SurfacePoint {
-        position: [number(0), number(4), number(8)],
-        normal: [number(12), number(16), number(20)],
-        grey: bytes[24],
-        sigma: number(27),
-        keyframes: bytes[31],
-    };
+fn point_of(mut bytes: &[u8]) -> Option<SurfacePoint> {
+    let bytes = &mut bytes;
+    let ([position, normal], [grey, ..]) = (take(bytes)?, take::<[u8; 3]>(bytes)?);
+    let (sigma, keyframes) = (take(bytes)?, take(bytes)?);
+    let point = SurfacePoint { position, normal, grey, sigma, keyframes };
     let numbers = || point.position.iter().chain(&point.normal).chain([&point.sigma]);
     numbers().all(|number| number.is_finite()).then_some(point)
 }
