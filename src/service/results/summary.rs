@@ -15,7 +15,7 @@ use crate::service::results::record::{
 };
 use crate::service::results::step_times::StepTimes;
 use crate::service::results::times::{LatencySummary, Percentiles};
-use crate::service::results::untracked::Untracked;
+use crate::service::results::untracked::why_untracked;
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::evaluation::depth_error::{
     DepthErrors, DepthScale, KeyframeDepth, depth_scale_ratio,
@@ -352,7 +352,7 @@ impl Summary {
             map_rejections: record.rejections.clone(),
             whitened_residual_median: whitened_residual_median(&record.poses),
             initialization_secs: initialization_secs(&record.poses),
-            untracked: Untracked::of(record).map(|why| why.to_string()),
+            untracked: why_untracked(record),
             keyframes: record.map.keyframes.len() as u64,
             keyframes_without_depth: without_depth(&record.map),
             point_counts: points,

@@ -1,7 +1,5 @@
 //! Why a run has tracked nothing, according to what its start saw.
 
-use std::fmt;
-
 use crate::service::results::mapping_load::is_overloaded;
 use crate::service::results::record::RunRecord;
 use crate::slam::counted::counted;
@@ -14,108 +12,69 @@ use crate::slam::pose::{LostReason, TrackingState};
 /// Fewest frames with which a map can begin and one be tracked on it: a start is confirmed by its third.
 const MIN_FRAMES: u64 = 5;
 
-/// The machine mapped too few of the frames.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Slowness {
-    /// Frames from the source.
-    pub frames_in: u64,
-    /// Those that the mapper had no time for.
-    pub skipped: u64,
-    /// Median time of the mapper for a frame, milliseconds; 0 where it mapped none.
-    pub map_ms: f64,
-    /// Time between two frames, milliseconds.
-    pub period_ms: f64,
+/// Why `record` has no tracked frame, and what to do; `None` where it has one.
+pub fn why_untracked(record: &RunRecord) -> Option<String> {
+    if record.poses.iter().any(|pose| pose.estimate.state.is_tracked()) {
+        return None;
+    }
+    let frames_in = record.frames_in.max(record.poses.len() as u64);
+    if frames_in == 0 {
+        return Some("the source delivered no frame".to_owned());
+    }
+    if record.depth_scale == DepthScale::Given && record.poses.is_empty() {
+        return Some(
+            "no frame has a true pose near its stamp; check that images and ground truth have the same clock"
+                .to_owned(),
+        );
+    }
+    let slowness = slowness(record, frames_in);
+    if let Some((began, reason)) = lost_at_once(record) {
+        let usual = || "move the camera more slowly, or raise the frame rate".to_owned();
+        return Some(format!(
+            "a map started at frame {began}, but the tracker lost it at once: {}; {}",
+            loss_text(reason),
+            slowness.unwrap_or_else(usual)
+        ));
+    }
+    let all: u64 = record.start.0.values().sum();
+    let most = record.start.0.iter().max_by_key(|(_, count)| **count);
+    let (&seen, &count) = most.unwrap_or((&StartFrame::Begun, &0));
+    // Nothing can be proven between frames that are far apart; darkness and a still camera show all the same.
+    let is_far_apart =
+        matches!(seen, StartFrame::Unmatched | StartFrame::Turned | StartFrame::LittleParallax);
+    Some(match slowness.filter(|_| is_far_apart || all < MIN_FRAMES) {
+        Some(slowness) => slowness,
+        None if frames_in < MIN_FRAMES => too_few_text(frames_in),
+        None if all == 0 => advice(seen).to_owned(),
+        None => format!("{} ({count} of {all} frames of the start)", advice(seen)),
+    })
 }
 
-impl fmt::Display for Slowness {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { frames_in, skipped, map_ms, period_ms } = self;
-        write!(
-            f,
-            "the machine is too slow: the mapper had no time for {skipped} of {frames_in} frames \
-             ({map_ms:.1} ms for one, one every {period_ms:.1} ms); lower the rate or the image size, give it more \
-             CPUs, or use --lockstep for a recording"
-        )
-    }
+fn too_few_text(frames: u64) -> String {
+    format!(
+        "{} {} too few: a map starts only after the camera has moved sideways for several frames",
+        counted(frames, "frame"),
+        if frames == 1 { "is" } else { "are" }
+    )
 }
 
-/// Why nothing was tracked, and what to do.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Untracked {
-    /// The source gave no frame.
-    NoFrame,
-    /// There were too few: this many.
-    FewFrames(u64),
-    /// Poses were to be given, but none is close to a frame.
-    NoGivenPose,
-    /// The machine mapped too few of them.
-    TooSlow(Slowness),
-    /// Most frames had this outcome: their number, and that of all.
-    Seen(StartFrame, u64, u64),
-    /// A map began, but no frame could be tracked on it.
-    LostAtOnce {
-        /// Sequence of the frame on which it began.
-        began: u64,
-        /// Why its first frame was lost.
-        reason: LostReason,
-        /// Set where the machine was too slow as well.
-        slowness: Option<Slowness>,
-    },
-}
-
-impl Untracked {
-    /// Why `record` has no tracked frame; `None` where it has one.
-    pub fn of(record: &RunRecord) -> Option<Self> {
-        if record.poses.iter().any(|pose| pose.estimate.state.is_tracked()) {
-            return None;
-        }
-        let frames_in = record.frames_in.max(record.poses.len() as u64);
-        if frames_in == 0 {
-            return Some(Self::NoFrame);
-        }
-        if record.depth_scale == DepthScale::Given && record.poses.is_empty() {
-            return Some(Self::NoGivenPose);
-        }
-        if let Some(lost) = Self::lost_at_once(record, frames_in) {
-            return Some(lost);
-        }
-        let all: u64 = record.start.0.values().sum();
-        let most = record.start.0.iter().max_by_key(|(_, count)| **count);
-        let (&seen, &count) = most.unwrap_or((&StartFrame::Begun, &0));
-        // Nothing can be proven between frames that are far apart; darkness and a still camera show all the same.
-        let is_far_apart =
-            matches!(seen, StartFrame::Unmatched | StartFrame::Turned | StartFrame::LittleParallax);
-        let slowness = slowness(record, frames_in);
-        if let Some(slowness) = slowness.filter(|_| is_far_apart || all < MIN_FRAMES) {
-            return Some(Self::TooSlow(slowness));
-        }
-        Some(match frames_in < MIN_FRAMES {
-            true => Self::FewFrames(frames_in),
-            false => Self::Seen(seen, count, all),
-        })
-    }
-
-    /// For a run with lost frames: a frame is lost only where there is a map.
-    fn lost_at_once(record: &RunRecord, frames_in: u64) -> Option<Self> {
-        let mut estimates = record.poses.iter().map(|pose| &pose.estimate);
-        let (lost, reason) = estimates.find_map(|estimate| match estimate.state {
-            TrackingState::Lost(reason) => Some((estimate, reason)),
-            _ => None,
-        })?;
-        let is_its = |keyframe: &&Keyframe| {
-            (keyframe.epoch, keyframe.keyframe_id) == (lost.epoch, lost.keyframe_id)
-        };
-        let keyframe = record.map.keyframes.iter().find(is_its);
-        Some(Self::LostAtOnce {
-            began: keyframe.map_or(lost.sequence, |keyframe| keyframe.sequence),
-            reason,
-            slowness: slowness(record, frames_in),
-        })
-    }
+/// For a run with lost frames: the frame on which its map began, and why the first one was lost. A frame is lost only
+/// where there is a map.
+fn lost_at_once(record: &RunRecord) -> Option<(u64, LostReason)> {
+    let mut estimates = record.poses.iter().map(|pose| &pose.estimate);
+    let (lost, reason) = estimates.find_map(|estimate| match estimate.state {
+        TrackingState::Lost(reason) => Some((estimate, reason)),
+        _ => None,
+    })?;
+    let is_its = |keyframe: &&Keyframe| {
+        (keyframe.epoch, keyframe.keyframe_id) == (lost.epoch, lost.keyframe_id)
+    };
+    let keyframe = record.map.keyframes.iter().find(is_its);
+    Some((keyframe.map_or(lost.sequence, |keyframe| keyframe.sequence), reason))
 }
 
 /// Set where a live run left out so many frames that the rest are too far apart.
-fn slowness(record: &RunRecord, frames_in: u64) -> Option<Slowness> {
+fn slowness(record: &RunRecord, frames_in: u64) -> Option<String> {
     let skipped = frames_in.saturating_sub(record.map_nanos.len() as u64);
     if !is_overloaded(record.mode, skipped, frames_in) {
         return None;
@@ -123,40 +82,11 @@ fn slowness(record: &RunRecord, frames_in: u64) -> Option<Slowness> {
     let times = record.map_nanos.iter().map(|&n| n as f64 * 1e-6);
     let period_ms = record.recorded_nanos as f64 * 1e-6 / frames_in.saturating_sub(1).max(1) as f64;
     let [map_ms] = percentiles(times, [0.5]).unwrap_or_default();
-    Some(Slowness { frames_in, skipped, map_ms, period_ms })
-}
-
-impl fmt::Display for Untracked {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match *self {
-            Self::NoFrame => f.write_str("the source delivered no frame"),
-            Self::FewFrames(frames) => write!(
-                f,
-                "{} {} too few: a map starts only after the camera has moved sideways for several frames",
-                counted(frames, "frame"),
-                if frames == 1 { "is" } else { "are" }
-            ),
-            Self::TooSlow(slowness) => slowness.fmt(f),
-            Self::NoGivenPose => f.write_str(
-                "no frame has a true pose near its stamp; check that images and ground truth have the same clock",
-            ),
-            Self::Seen(seen, _, 0) => f.write_str(advice(seen)),
-            Self::Seen(seen, count, all) => {
-                write!(f, "{} ({count} of {all} frames of the start)", advice(seen))
-            }
-            Self::LostAtOnce { began, reason, slowness } => {
-                write!(
-                    f,
-                    "a map started at frame {began}, but the tracker lost it at once: {}; ",
-                    loss_text(reason)
-                )?;
-                match slowness {
-                    Some(slowness) => slowness.fmt(f),
-                    None => f.write_str("move the camera more slowly, or raise the frame rate"),
-                }
-            }
-        }
-    }
+    Some(format!(
+        "the machine is too slow: the mapper had no time for {skipped} of {frames_in} frames \
+         ({map_ms:.1} ms for one, one every {period_ms:.1} ms); lower the rate or the image size, give it more \
+         CPUs, or use --lockstep for a recording"
+    ))
 }
 
 fn loss_text(reason: LostReason) -> &'static str {
@@ -236,7 +166,7 @@ pub(super) mod tests {
 
     #[test]
     fn one_frame_is_too_few() {
-        let text = |frames| Untracked::FewFrames(frames).to_string();
+        let text = too_few_text;
         assert!(
             text(1).starts_with("1 frame is too few:") && text(3).starts_with("3 frames are too")
         );
@@ -245,7 +175,7 @@ pub(super) mod tests {
     #[test]
     fn lost_frames_show_that_a_map_began() {
         let lost = TrackingState::Lost(LostReason::TooFewInliers);
-        let text = |record: &RunRecord| Untracked::of(record).unwrap().to_string();
+        let text = |record: &RunRecord| why_untracked(record).unwrap();
         let of_lost = text(&record(60, 60, lost));
         let expected = "a map started at frame 10, but the tracker lost it at once: too few points matched; move";
         assert!(of_lost.starts_with(expected), "{of_lost}");
@@ -257,6 +187,6 @@ pub(super) mod tests {
             "{without_map}"
         );
         assert!(text(&record(60, 20, TrackingState::Initializing)).contains("too slow"));
-        assert_eq!(Untracked::of(&record(60, 60, TrackingState::Tracking)), None);
+        assert_eq!(why_untracked(&record(60, 60, TrackingState::Tracking)), None);
     }
 }
