@@ -291,10 +291,11 @@ pub fn journal(bytes: &[u8]) {
     assert!(found.counters.frames_in >= poses as u64);
     let known = RunRecord {
         map,
+        counters: found.counters,
         is_depth_from_sensor: found.start.is_depth_from_sensor,
         ..RunRecord::empty(found.start.mode, &found.start.source.to_os_string().to_string_lossy())
     };
-    let record = found.recording.into_record(known, &found.counters, 0.0);
+    let record = found.recording.into_record(known, 0.0);
     assert_eq!(record.poses.len(), poses);
     let _ = Config::from_text(&found.start.config, "journal");
 }

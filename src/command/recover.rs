@@ -218,11 +218,12 @@ fn record_of(
         map: recovered.map(folder, config.mapping.max_map_bytes() as u64),
         first_keyframe_id: start.first_keyframe_id,
         ground_truth: source.ground_truth().to_vec(),
+        counters: recovered.counters,
         depth_scale,
         is_depth_from_sensor: start.is_depth_from_sensor,
         ..RunRecord::empty(start.mode, &start.source.to_os_string().to_string_lossy())
     };
-    recovered.recording.into_record(known, &recovered.counters, config.tracker.deadline_ms)
+    recovered.recording.into_record(known, config.tracker.deadline_ms)
 }
 
 /// A source that no longer exists, or never had ground truth.

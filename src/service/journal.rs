@@ -29,7 +29,7 @@ use crate::service::journal::folder::{Pointer, begin_folder, lock, remove_folder
 use crate::service::journal::log::{Record, RunStart, log_header, read_log};
 use crate::service::journal::recovered::read_map_of;
 use crate::service::journal::writer::{Entry, Writer};
-use crate::service::recording::RunCounters;
+use crate::service::results::record::RunCounters;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 use crate::wire::message::PoseMessage;

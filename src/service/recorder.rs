@@ -7,8 +7,8 @@ use crate::service::journal::feed::KeyframeFeed;
 use crate::service::journal::log::{Record, Step};
 use crate::service::journal::recovered::complete;
 use crate::service::journal::{Journal, JournalOptions};
-use crate::service::recording::{Recording, RunCounters};
-use crate::service::results::record::RunRecord;
+use crate::service::recording::Recording;
+use crate::service::results::record::{RunCounters, RunRecord};
 use crate::slam::map::Map;
 use crate::wire::message::{AdjustmentMessage, PoseMessage, StepMessage};
 use crate::wire::place::Place;
@@ -152,11 +152,10 @@ impl Recorder {
     pub fn into_record(
         mut self,
         known: RunRecord,
-        counters: RunCounters,
         deadline_ms: f64,
     ) -> (RunRecord, Option<Journal>) {
-        self.count(counters);
+        self.count(known.counters);
         self.collect_keyframes(true);
-        (self.recording.into_record(known, &counters, deadline_ms), self.journal)
+        (self.recording.into_record(known, deadline_ms), self.journal)
     }
 }

@@ -1,51 +1,11 @@
 //! Poses, times and counts collected during a run, until they become a record.
 
-use serde::{Deserialize, Serialize};
-
 use crate::service::adjustments::AdjustmentRecord;
 use crate::service::results::record::{RecordedPose, RunMode, RunRecord, StartTally};
-use crate::service::time_counts::TimeCounts;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::pose::TrackingState;
 use crate::wire::conversion::{MessageError, pose_from_message, start_frame_from_code};
 use crate::wire::message::PoseMessage;
-
-/// Counts of a run that only the supervisor has.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(default)]
-pub struct RunCounters {
-    /// Frames that capture sent.
-    pub frames_in: u64,
-    /// Images that the source could not deliver.
-    pub frames_refused: u64,
-    /// Largest factor on the grey levels of dim images; `None` where brightening is off.
-    pub brightened_by: Option<u8>,
-    /// Gaps in the source's sequence.
-    pub gaps: u64,
-    /// Processes that were restarted.
-    pub restarts: u64,
-    /// Frames published after the deadline.
-    pub deadline_misses: u64,
-    /// Page faults of the tracker's frame loop since it was warm.
-    pub page_faults: u64,
-    /// Largest resident memory of all processes together, bytes.
-    pub peak_rss_bytes: u64,
-    /// Live: how long after its stamp capture sent each frame.
-    pub send_counts: TimeCounts,
-}
-
-impl RunCounters {
-    /// Adds the frame counts of one process.
-    pub fn add(&mut self, counted: &Self) {
-        self.frames_in += counted.frames_in;
-        self.frames_refused += counted.frames_refused;
-        self.brightened_by = self.brightened_by.max(counted.brightened_by);
-        self.gaps += counted.gaps;
-        self.deadline_misses += counted.deadline_misses;
-        self.page_faults += counted.page_faults;
-        self.send_counts.add(&counted.send_counts);
-    }
-}
 
 /// Poses and steps of a run so far.
 #[derive(Debug, Default)]
@@ -134,17 +94,13 @@ impl Recording {
 
     /// The record of the whole run, once all released poses have been taken back. `known` has what is not collected;
     /// `deadline_ms` is the tracker's configured deadline.
-    pub fn into_record(
-        mut self,
-        known: RunRecord,
-        counters: &RunCounters,
-        deadline_ms: f64,
-    ) -> RunRecord {
+    pub fn into_record(mut self, known: RunRecord, deadline_ms: f64) -> RunRecord {
+        let frames_in = known.counters.frames_in;
         let stamps = |pose: Option<&RecordedPose>| pose.map_or(0, |p| p.estimate.capture_nanos);
         let (first, last) = (stamps(self.poses.first()), stamps(self.poses.last()));
         let positive = |nanos: i64| u64::try_from(nanos).unwrap_or(0);
         let recorded_nanos = positive(last.saturating_sub(first));
-        let period_nanos = recorded_nanos / counters.frames_in.saturating_sub(1).max(1);
+        let period_nanos = recorded_nanos / frames_in.saturating_sub(1).max(1);
         let deadline_nanos =
             if deadline_ms > 0.0 { (deadline_ms * 1e6) as u64 } else { period_nanos / 2 };
         let (is_live, is_replay) = (known.mode == RunMode::Live, known.mode == RunMode::Replay);
@@ -158,18 +114,10 @@ impl Recording {
         }
         let skipped = self.poses.len().saturating_sub(self.map_nanos.len());
         RunRecord {
-            frames_in: counters.frames_in,
-            frames_refused: counters.frames_refused,
-            brightened_by: counters.brightened_by,
-            frames_dropped: counters.frames_in.saturating_sub(self.poses.len() as u64),
+            frames_dropped: frames_in.saturating_sub(self.poses.len() as u64),
             poses: self.poses,
-            gaps: counters.gaps,
-            restarts: counters.restarts,
             frames_skipped_by_mapper: (!is_replay).then_some(skipped as u64),
             deadline_nanos: is_live.then_some(deadline_nanos),
-            deadline_misses: is_live.then_some(counters.deadline_misses),
-            send_counts: is_live.then_some(counters.send_counts),
-            page_faults: is_live.then_some(counters.page_faults),
             map_nanos: self.map_nanos,
             keyframe_step_nanos: self.keyframe_step_nanos,
             keyframe_nanos: self.keyframe_nanos,
@@ -177,7 +125,6 @@ impl Recording {
             start: self.start,
             recorded_nanos,
             wall_nanos: positive(wall_nanos),
-            peak_rss_bytes: (counters.peak_rss_bytes > 0).then_some(counters.peak_rss_bytes),
             ..known
         }
     }
@@ -197,6 +144,9 @@ fn recorded(message: &PoseMessage) -> Result<RecordedPose, MessageError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::service::results::record::RunCounters;
+    use crate::service::results::summary::{PointCounts, Summary};
+    use crate::slam::evaluation::depth_error::DepthErrors;
     use crate::slam::frame::FrameView;
     use crate::slam::pose::PoseEstimate;
     use crate::wire::conversion::{PoseTiming, pose_message};
@@ -224,9 +174,12 @@ mod tests {
     fn only_a_live_run_has_a_deadline_and_page_faults_that_may_cost_it() {
         let record = |mode| {
             let counters = RunCounters { page_faults: 3, ..RunCounters::default() };
-            let known = RunRecord::empty(mode, "x");
-            let record = Recording::default().into_record(known, &counters, 5.0);
-            (record.page_faults, record.deadline_nanos)
+            let known = RunRecord { counters, ..RunRecord::empty(mode, "x") };
+            let record = Recording::default().into_record(known, 5.0);
+            let points = PointCounts::default();
+            let depth = DepthErrors::default();
+            let summary = Summary::new(&record, points, None, None, [None; 3], depth);
+            (summary.page_faults, record.deadline_nanos)
         };
         assert_eq!(record(RunMode::Live), (Some(3), Some(5_000_000)));
         assert_eq!(record(RunMode::Lockstep), (None, None));

@@ -122,7 +122,7 @@ pub enum ReplayError {
     #[error(transparent)]
     Source(#[from] SourceError),
     /// The source failed later; the frames before are complete.
-    #[error("{cause}; the results cover the {} frames before it", record.frames_in)]
+    #[error("{cause}; the results cover the {} frames before it", record.counters.frames_in)]
     Cut {
         /// Everything up to then.
         record: Box<RunRecord>,
@@ -192,8 +192,8 @@ pub fn replay(
         return Err(error.into());
     }
     let (mut record, saved) = replay.finish(begin)?;
-    (record.frames_refused, record.refused) = (refused.count(), refused.text());
-    record.brightened_by = source.max_factor();
+    (record.counters.frames_refused, record.refused) = (refused.count(), refused.text());
+    record.counters.brightened_by = source.max_factor();
     match (fault, saved) {
         (None, Ok(())) => Ok(record),
         (None, Err(cause)) => Err(ReplayError::Unsaved { record: Box::new(record), cause }),
@@ -304,13 +304,13 @@ impl<'a> Replay<'a> {
                     frames.give_back(read.pixels);
                     continue;
                 }
-                Err(cause) if self.record.frames_in > 0 => return Ok(Some(cause)),
+                Err(cause) if self.record.counters.frames_in > 0 => return Ok(Some(cause)),
                 Err(cause) => return Err(cause.into()),
             };
             refused.accept();
             let (state, outcome) = self.step(&stamp, &read.pixels, read.sensor_depth)?;
             frames.give_back(read.pixels);
-            let done = self.record.frames_in as usize;
+            let done = self.record.counters.frames_in as usize;
             let (record, map, keyframe) = (&self.record, self.mapper.map(), self.mapper.keyframe());
             let start_frame = self.mapper.start_frame();
             let progress =
@@ -393,7 +393,7 @@ impl<'a> Replay<'a> {
             }
             depth => depth?,
         };
-        if sensor_depth.is_none() && self.record.frames_in == 1 {
+        if sensor_depth.is_none() && self.record.counters.frames_in == 1 {
             return Err(ReplayError::NoSensorDepth(self.record.source.clone()));
         }
         Ok(sensor_depth)
@@ -451,14 +451,14 @@ impl<'a> Replay<'a> {
     }
 
     fn count(&mut self, stamp: &FrameStamp) {
-        self.record.frames_in += 1;
+        self.record.counters.frames_in += 1;
         if self.stamps.is_none() && self.config.poses == PoseOrigin::GroundTruth {
             let truth = &self.record.ground_truth;
             self.given_poses = truth_in_first_camera(truth, stamp.capture_nanos);
         }
         let (first, last) = self.stamps.unwrap_or((*stamp, *stamp));
         let expected = last.sequence.saturating_add(1);
-        self.record.gaps += u64::from(self.stamps.is_some() && stamp.sequence > expected);
+        self.record.counters.gaps += u64::from(self.stamps.is_some() && stamp.sequence > expected);
         self.stamps = Some((first, *stamp));
     }
 
@@ -486,7 +486,7 @@ impl<'a> Replay<'a> {
         record.budget_samples = samples;
         record.wall_nanos = elapsed_nanos(begin).saturating_sub(rehearsal_nanos);
         record.map = self.mapper.into_map();
-        record.peak_rss_bytes = peak_rss_bytes();
+        record.counters.peak_rss_bytes = peak_rss_bytes().unwrap_or(0);
         Ok((record, saved))
     }
 }

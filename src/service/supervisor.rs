@@ -23,8 +23,7 @@ use crate::service::mode::Mode;
 use crate::service::peers::Peer;
 use crate::service::position::{position_key, read_position};
 use crate::service::recorder::Recorder;
-use crate::service::recording::RunCounters;
-use crate::service::results::record::{EndOfRun, RestartCause, RunMode, RunRecord};
+use crate::service::results::record::{EndOfRun, RestartCause, RunCounters, RunMode, RunRecord};
 pub use crate::service::run_error::RunError;
 use crate::service::run_progress::RunProgress;
 use crate::service::schedule::peak_rss_bytes;
@@ -151,6 +150,7 @@ fn supervise(
     let mode = if options.mode == Mode::Live { RunMode::Live } else { RunMode::Lockstep };
     let known = RunRecord {
         ended,
+        counters,
         refused,
         restart_causes,
         map,
@@ -159,7 +159,7 @@ fn supervise(
         ground_truth: source.ground_truth().to_vec(),
         ..RunRecord::empty(mode, &options.source.to_string())
     };
-    let (record, journal) = recorder.into_record(known, counters, config.tracker.deadline_ms);
+    let (record, journal) = recorder.into_record(known, config.tracker.deadline_ms);
     Ok(RunOutcome { record, journal, source })
 }
 

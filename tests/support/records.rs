@@ -4,7 +4,9 @@ use semidense::capture::source::{FrameSource, FrameStamp};
 use semidense::capture::source_error::SourceError;
 use semidense::service::alignment_stamps::{AlignmentTrace, LevelTrace};
 use semidense::service::results::output_folder::prepare_output;
-use semidense::service::results::record::{EndOfRun, RecordedPose, RunMode, RunRecord};
+use semidense::service::results::record::{
+    EndOfRun, RecordedPose, RunCounters, RunMode, RunRecord,
+};
 use semidense::service::results::{Results, ResultsParams};
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
@@ -123,7 +125,7 @@ pub fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bo
         poses,
         map: Map { keyframes, ..Map::default() },
         ground_truth: if with_truth { (0..frames).map(pose).collect() } else { Vec::new() },
-        frames_in: frames as u64,
+        counters: RunCounters { frames_in: frames as u64, ..RunCounters::default() },
         map_nanos: vec![2_000_000; frames],
         keyframe_step_nanos: vec![5_000_000; 3],
         keyframe_nanos: vec![3_000_000; 3],

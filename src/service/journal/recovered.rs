@@ -10,7 +10,8 @@ use crate::service::adjustments::message::adjustment_from_message;
 use crate::service::journal::folder::{LOG, keyframe_file};
 use crate::service::journal::log::{Record, RunStart, read_log};
 use crate::service::map_file::read_map;
-use crate::service::recording::{Recording, RunCounters};
+use crate::service::recording::Recording;
+use crate::service::results::record::RunCounters;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 

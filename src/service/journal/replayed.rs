@@ -7,7 +7,6 @@ use std::time::{Duration, Instant};
 use crate::service::adjustments::message::adjustment_message;
 use crate::service::journal::log::{Record, Step};
 use crate::service::journal::{Journal, JournalOptions};
-use crate::service::recording::RunCounters;
 use crate::service::replay::ReplayProgress;
 use crate::service::results::record::RunRecord;
 use crate::slam::keyframe::{Keyframe, KeyframePose};
@@ -64,8 +63,7 @@ impl ReplayJournal {
             self.take_keyframes(&progress.map.keyframes);
         }
         if self.journal.wants_counters() {
-            let RunRecord { frames_in, gaps, .. } = *progress.record;
-            self.journal.count(RunCounters { frames_in, gaps, ..RunCounters::default() });
+            self.journal.count(progress.record.counters);
         }
     }
 

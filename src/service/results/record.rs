@@ -91,6 +91,43 @@ pub struct RestartCause {
     pub count: u64,
 }
 
+/// Counts of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct RunCounters {
+    /// Frames that the source delivered.
+    pub frames_in: u64,
+    /// Images of the source that could not be used and were left out.
+    pub frames_refused: u64,
+    /// Largest factor on the grey levels of dim images; `None` where brightening is off.
+    pub brightened_by: Option<u8>,
+    /// Gaps in the source's sequence.
+    pub gaps: u64,
+    /// Processes that were restarted.
+    pub restarts: u64,
+    /// Live: frames published after the deadline.
+    pub deadline_misses: u64,
+    /// Live: page faults of the tracker's frame loop since it was warm.
+    pub page_faults: u64,
+    /// Largest resident memory of all processes together, bytes; 0 where it is unknown.
+    pub peak_rss_bytes: u64,
+    /// Live: how long after its stamp capture sent each frame.
+    pub send_counts: TimeCounts,
+}
+
+impl RunCounters {
+    /// Adds the frame counts of one process.
+    pub fn add(&mut self, counted: &Self) {
+        self.frames_in += counted.frames_in;
+        self.frames_refused += counted.frames_refused;
+        self.brightened_by = self.brightened_by.max(counted.brightened_by);
+        self.gaps += counted.gaps;
+        self.deadline_misses += counted.deadline_misses;
+        self.page_faults += counted.page_faults;
+        self.send_counts.add(&counted.send_counts);
+    }
+}
+
 /// A map that a running mapper was switched to.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoadedMap {
@@ -128,32 +165,18 @@ pub struct RunRecord {
     /// Whether keyframes took their first depth from the source's depth camera: a comparison with that camera then
     /// shows nothing.
     pub is_depth_from_sensor: bool,
-    /// Frames that the source delivered.
-    pub frames_in: u64,
-    /// Images of the source that could not be used and were left out.
-    pub frames_refused: u64,
-    /// The first of them, and why.
+    /// Counts of frames, processes and faults.
+    pub counters: RunCounters,
+    /// The first of the images that could not be used, and why.
     pub refused: Option<String>,
-    /// Largest factor on the grey levels of dim images; `None` where brightening is off.
-    pub brightened_by: Option<u8>,
     /// Frames that the tracker never saw because a newer one had arrived.
     pub frames_dropped: u64,
-    /// Gaps in the source's sequence.
-    pub gaps: u64,
-    /// Processes that were restarted.
-    pub restarts: u64,
     /// Which processes, and why; empty in one process.
     pub restart_causes: Vec<RestartCause>,
     /// Frames with a pose that the mapper skipped because newer ones had arrived; `None` in one process.
     pub frames_skipped_by_mapper: Option<u64>,
     /// Time allowed to the tracker for a frame; `None` without a deadline.
     pub deadline_nanos: Option<u64>,
-    /// Frames published after the deadline; `None` without one.
-    pub deadline_misses: Option<u64>,
-    /// How long after their stamp capture sent frames; `None` except for live runs.
-    pub send_counts: Option<TimeCounts>,
-    /// Page faults of the tracker's frame loop since it was warm; `None` except for live runs.
-    pub page_faults: Option<u64>,
     /// Time in the mapper, one per frame it mapped.
     pub map_nanos: Vec<u64>,
     /// Those of the steps that changed to a new keyframe.
@@ -175,8 +198,6 @@ pub struct RunRecord {
     pub recorded_nanos: u64,
     /// Duration of the run, without the preparation of the source and the realigned frames.
     pub wall_nanos: u64,
-    /// Largest resident memory of all processes together.
-    pub peak_rss_bytes: Option<u64>,
 }
 
 impl RunRecord {

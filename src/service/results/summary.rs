@@ -333,6 +333,7 @@ impl Summary {
     ) -> Self {
         let (recorded_secs, wall_secs) = (secs(record.recorded_nanos), secs(record.wall_nanos));
         let (ended, failure, recovered_run_end) = end_in_words(&record.ended);
+        let (counters, is_live) = (&record.counters, record.mode == RunMode::Live);
         Self {
             mode: record.mode,
             source: record.source.clone(),
@@ -341,13 +342,13 @@ impl Summary {
             failure,
             recovered_run_end,
             grade: grade(record),
-            frames_in: record.frames_in,
-            frames_refused: record.frames_refused,
+            frames_in: counters.frames_in,
+            frames_refused: counters.frames_refused,
             refused: record.refused.clone(),
-            brightened_by: record.brightened_by,
+            brightened_by: counters.brightened_by,
             frames: FrameCounts::of(&record.poses, &record.map),
             frames_dropped: record.frames_dropped,
-            gaps: record.gaps,
+            gaps: counters.gaps,
             lost_count: count_losses(&record.poses),
             map_rejections: record.rejections.clone(),
             whitened_residual_median: whitened_residual_median(&record.poses),
@@ -359,12 +360,12 @@ impl Summary {
             epoch: record.poses.last().map_or(0, |pose| pose.estimate.epoch),
             epochs: count_epochs(record, 0),
             evaluated_epoch: trajectory.and_then(|_| longest_epoch(record)),
-            send_ms: record.send_counts.as_ref().and_then(Percentiles::of_counts),
+            send_ms: is_live.then(|| Percentiles::of_counts(&counters.send_counts)).flatten(),
             latency: LatencySummary::of(&record.poses),
             deadline_ms: record.deadline_nanos.map(|n| n as f64 * 1e-6),
-            deadline_misses: record.deadline_misses,
-            page_faults: record.page_faults,
-            restarts: record.restarts,
+            deadline_misses: is_live.then_some(counters.deadline_misses),
+            page_faults: is_live.then_some(counters.page_faults),
+            restarts: counters.restarts,
             restarts_by_process: restarts_by_process(&record.restart_causes),
             restart_causes: record.restart_causes.clone(),
             frames_skipped_by_mapper: record.frames_skipped_by_mapper,
@@ -375,7 +376,8 @@ impl Summary {
             recorded_secs,
             wall_secs,
             realtime_factor: (wall_secs > 0.0).then(|| recorded_secs / wall_secs),
-            peak_rss_mb: record.peak_rss_bytes.map(|bytes| bytes as f64 / BYTES_PER_MB),
+            peak_rss_mb: (counters.peak_rss_bytes > 0)
+                .then(|| counters.peak_rss_bytes as f64 / BYTES_PER_MB),
             trajectory: trajectory.map(TrajectorySummary::from).unwrap_or_default(),
             online: online.map(TrajectorySummary::from).unwrap_or_default(),
             nees: nees[0].as_ref().map(NeesSummary::from).unwrap_or_default(),

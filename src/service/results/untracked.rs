@@ -17,7 +17,7 @@ pub fn why_untracked(record: &RunRecord) -> Option<String> {
     if record.poses.iter().any(|pose| pose.estimate.state.is_tracked()) {
         return None;
     }
-    let frames_in = record.frames_in.max(record.poses.len() as u64);
+    let frames_in = record.counters.frames_in.max(record.poses.len() as u64);
     if frames_in == 0 {
         return Some("the source delivered no frame".to_owned());
     }
@@ -129,8 +129,8 @@ fn advice(seen: StartFrame) -> &'static str {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::service::recording::{Recording, RunCounters};
-    use crate::service::results::record::RunMode;
+    use crate::service::recording::Recording;
+    use crate::service::results::record::{RunCounters, RunMode};
     use crate::slam::frame::FrameView;
     use crate::slam::pose::PoseEstimate;
     use crate::wire::conversion::{PoseTiming, pose_message};
@@ -161,7 +161,7 @@ pub(super) mod tests {
         const UNMATCHED: u32 = 5;
         (0..handled).for_each(|_| recording.add_step(40_000_000, 0, UNMATCHED));
         let counters = RunCounters { frames_in: frames, ..RunCounters::default() };
-        recording.into_record(RunRecord::empty(RunMode::Live, "x"), &counters, 0.0)
+        recording.into_record(RunRecord { counters, ..RunRecord::empty(RunMode::Live, "x") }, 0.0)
     }
 
     #[test]
