@@ -237,7 +237,7 @@ impl Config {
     pub fn to_text(&self) -> String {
         // Every field is a plain value that TOML can hold. As text, numbers keep their shortest form.
         let flat = toml::to_string(self).unwrap_or_default().parse().unwrap_or_default();
-        toml::to_string(&layout::split(flat)).unwrap_or_default()
+        toml::to_string(&layout::split(&flat)).unwrap_or_default()
     }
 
     /// Reads the text of a configuration that came from `file`; keys it does not name have their defaults.
@@ -424,18 +424,13 @@ fn apply(table: &mut Table, setting: &str) -> Result<(), String> {
     if let Some(now) = layout::moved(key) {
         return Err(format!("`{key}` is now `{now}`"));
     }
-    let mut keys: Vec<&str> = key.split('.').map(str::trim).collect();
-    let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(|| form.to_owned())?;
-    if keys.is_empty() && last == layout::EXPERT {
+    if key.is_empty() || key.ends_with('.') {
+        return Err(form.to_owned());
+    }
+    if key == layout::EXPERT {
         return Err("it has keys below it, as in expert.mapping.min_gradient=5.0".to_owned());
     }
-    let mut table = table;
-    for key in keys {
-        let entry = table.entry(key).or_insert_with(|| Value::Table(Table::new()));
-        table = entry.as_table_mut().ok_or_else(|| format!("`{key}` has no keys below it"))?;
-    }
-    table.insert(last.to_owned(), value);
-    Ok(())
+    layout::put(table, key, value)
 }
 
 #[cfg(test)]

@@ -145,37 +145,40 @@ fn merge_into<'a>(
 }
 
 /// Splits the `flat` table of all keys into two parts, as in the shipped file.
-pub fn split(flat: Table) -> Table {
-    let mut expert = Table::new();
-    let mut user = split_table(flat, "", &mut expert);
-    user.insert(EXPERT.to_owned(), Value::Table(expert));
-    user
+pub fn split(flat: &Table) -> Table {
+    let is_user = |(key, _): &(String, Value)| listed(key) == *key;
+    let (user, expert): (Vec<_>, Vec<_>) = flatten(flat).into_iter().partition(is_user);
+    let mut table = Table::new();
+    for (key, value) in user.into_iter().chain(expert) {
+        // Cannot fail: no value of the flat table is also a table.
+        let _ = put(&mut table, &listed(&key), value);
+    }
+    table
 }
 
-/// Moves the keys of `table` that are not a user's into `expert` and returns the rest.
-fn split_table(table: Table, prefix: &str, expert: &mut Table) -> Table {
-    let mut user = Table::new();
+/// The dotted keys in `table` and its subtables, with their values.
+pub fn flatten(table: &Table) -> Vec<(String, Value)> {
+    let mut keys = Vec::new();
     for (key, value) in table {
-        let path = format!("{prefix}{key}");
         match value {
             Value::Table(inner) => {
-                let mut below = Table::new();
-                let kept = split_table(inner, &format!("{path}."), &mut below);
-                let put = |table: &mut Table, inner: Table| {
-                    if !inner.is_empty() {
-                        table.insert(key.clone(), Value::Table(inner));
-                    }
-                };
-                put(&mut user, kept);
-                put(expert, below);
+                let below = flatten(inner).into_iter();
+                keys.extend(below.map(|(rest, value)| (format!("{key}.{rest}"), value)));
             }
-            value if USER_KEYS.contains(&path.as_str()) => {
-                user.insert(key, value);
-            }
-            value => {
-                expert.insert(key, value);
-            }
+            value => keys.push((key.clone(), value.clone())),
         }
     }
-    user
+    keys
+}
+
+/// Puts the value of a dotted key into `table`; an error if one of its parts has a value itself.
+pub fn put(mut table: &mut Table, key: &str, value: Value) -> Result<(), String> {
+    let mut keys: Vec<&str> = key.split('.').map(str::trim).collect();
+    let last = keys.pop().unwrap_or_default();
+    for key in keys {
+        let entry = table.entry(key).or_insert_with(|| Value::Table(Table::new()));
+        table = entry.as_table_mut().ok_or_else(|| format!("`{key}` has no keys below it"))?;
+    }
+    table.insert(last.to_owned(), value);
+    Ok(())
 }

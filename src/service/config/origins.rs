@@ -47,6 +47,8 @@ impl Config {
                 reason,
             })?;
         }
+        let (of_file, of_line) = (layout::flatten(&of_file), layout::flatten(&of_line));
+        let names = |keys: &[(String, Value)], key: &str| keys.iter().any(|(of, _)| of == key);
         let origin = |key: &str| match file {
             _ if names(&of_line, key) => Origin::CommandLine,
             Some(path) if names(&of_file, key) => Origin::File(path.to_owned()),
@@ -68,29 +70,8 @@ impl Config {
     fn flat(&self) -> Vec<(String, String)> {
         // As text, numbers keep their shortest form.
         let text = toml::to_string(self).unwrap_or_default();
-        let mut keys = Vec::new();
-        flatten(&text.parse().unwrap_or_default(), "", &mut keys);
-        keys
-    }
-}
-
-/// Collects the dotted keys in `table` and its subtables, with their values.
-fn flatten(table: &Table, prefix: &str, keys: &mut Vec<(String, String)>) {
-    for (key, value) in table {
-        match value {
-            Value::Table(inner) => flatten(inner, &format!("{prefix}{key}."), keys),
-            value => keys.push((format!("{prefix}{key}"), value.to_string())),
-        }
-    }
-}
-
-/// Whether `table` names the dotted `key`.
-fn names(table: &Table, key: &str) -> bool {
-    match key.split_once('.') {
-        None => table.contains_key(key),
-        Some((part, rest)) => {
-            table.get(part).and_then(Value::as_table).is_some_and(|inner| names(inner, rest))
-        }
+        let keys = layout::flatten(&text.parse().unwrap_or_default()).into_iter();
+        keys.map(|(key, value)| (key, value.to_string())).collect()
     }
 }
 
