@@ -126,24 +126,19 @@ pub fn warning(message: &HealthMessage) -> String {
     text_from_bytes(&message.warning, message.warning_bytes)
 }
 
+/// Policies and their names, in the order of their codes in [`HealthMessage`]; a larger code is an unknown one.
+const POLICIES: [(Policy, &str); 3] =
+    [(Policy::Other, "other"), (Policy::Fifo, "fifo"), (Policy::Deadline, "deadline")];
+
 /// The code of a policy in [`HealthMessage`].
 fn scheduling_code(policy: Option<Policy>) -> u32 {
-    match policy {
-        Some(Policy::Other) => 0,
-        Some(Policy::Fifo) => 1,
-        Some(Policy::Deadline) => 2,
-        Some(Policy::Inherit) | None => 3,
-    }
+    let known = POLICIES.iter().position(|(of, _)| Some(*of) == policy);
+    known.unwrap_or(POLICIES.len()) as u32
 }
 
 /// Name of a policy from its code.
 pub fn scheduling_name(code: u32) -> &'static str {
-    match code {
-        0 => "other",
-        1 => "fifo",
-        2 => "deadline",
-        _ => "unknown",
-    }
+    POLICIES.get(code as usize).map_or("unknown", |(_, name)| name)
 }
 
 /// A state with its cause and the length of that in bytes, as a process reported it.
