@@ -13,6 +13,7 @@ use crate::service::results::ResultsParams;
 use crate::service::results::full_points::write_full_points;
 use crate::service::results::pcd::write_pcd;
 use crate::service::results::ply::write_surface;
+use crate::service::results::poses::keyframe_pose;
 use crate::service::trajectory_file::write_trajectory;
 use crate::slam::fusion::fuse;
 use crate::slam::keyframe::Keyframe;
@@ -130,14 +131,7 @@ pub fn export(
         let path = folder.join("points-full.ply");
         write_full_points(&path, &map, params.max_relative_std_dev)?;
     }
-    let poses: Vec<StampedPose> = map
-        .keyframes
-        .iter()
-        .map(|keyframe| StampedPose {
-            nanos: keyframe.capture_nanos,
-            world_from_camera: keyframe.map_from_keyframe.rigid,
-        })
-        .collect();
+    let poses: Vec<StampedPose> = map.keyframes.iter().map(keyframe_pose).collect();
     let comment = "map_from_keyframe of every keyframe, map units";
     write_trajectory(&folder.join("keyframes.txt"), comment, &poses)?;
     Ok((surface.len(), poses.len()))

@@ -13,6 +13,7 @@ use crate::slam::evaluation::normalized_error::{
     NormalizedErrors, map_normalized_errors, normalized_errors,
 };
 use crate::slam::evaluation::velocity_error::velocity_normalized_errors;
+use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 use crate::slam::pose::PoseEstimate;
 use crate::slam::trajectory::{EpochPose, StampedPose};
@@ -143,6 +144,20 @@ pub fn normalized_errors_of(
     ]
 }
 
+/// The pose of a keyframe in the map.
+pub fn keyframe_pose(keyframe: &Keyframe) -> StampedPose {
+    StampedPose {
+        nanos: keyframe.capture_nanos,
+        world_from_camera: keyframe.map_from_keyframe.rigid,
+    }
+}
+
+/// The keyframes of the longest epoch: each epoch has a separate world and unit.
+pub fn keyframes_of_longest_epoch(record: &RunRecord) -> impl Iterator<Item = &Keyframe> {
+    let epoch = longest_epoch(record);
+    record.map.keyframes.iter().filter(move |k| epoch.is_none_or(|epoch| k.epoch == epoch))
+}
+
 /// Writes one line per keyframe: its pose as in a TUM file, then what a map needs besides.
 pub fn write_keyframes(path: &Path, map: &Map) -> io::Result<()> {
     write_atomically(path, |file| {
@@ -152,14 +167,10 @@ pub fn write_keyframes(path: &Path, map: &Map) -> io::Result<()> {
             "# timestamp tx ty tz qx qy qz qw scale keyframe_id sequence epoch points state"
         )?;
         map.keyframes.iter().try_for_each(|k| {
-            let pose = StampedPose {
-                nanos: k.capture_nanos,
-                world_from_camera: k.map_from_keyframe.rigid,
-            };
             writeln!(
                 file,
                 "{} {} {} {} {} {} {:?}",
-                tum_line(&pose),
+                tum_line(&keyframe_pose(k)),
                 k.map_from_keyframe.scale,
                 k.keyframe_id,
                 k.sequence,

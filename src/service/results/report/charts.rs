@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use crate::service::results::Results;
-use crate::service::results::poses::longest_epoch;
+use crate::service::results::poses::{keyframe_pose, keyframes_of_longest_epoch};
 use crate::service::results::record::RunRecord;
 use crate::service::results::report::chart::{Chart, Scaling};
 use crate::service::results::report::series::{Mark, Series};
@@ -13,7 +13,6 @@ use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::statistics::percentiles;
 use crate::slam::evaluation::windows::SCALE_WINDOW;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::keyframe::Keyframe;
 use crate::slam::trajectory::StampedPose;
 
 /// Colours that are distinguishable with any colour vision, on white and on black: of the truth,
@@ -104,15 +103,9 @@ fn truth_in_time(results: &Results<'_>) -> Vec<StampedPose> {
     results.record.ground_truth.iter().filter(|pose| time.contains(&pose.nanos)).copied().collect()
 }
 
-/// Poses of the keyframes of the longest epoch: each epoch has a separate world and unit.
+/// Poses of the keyframes of the longest epoch.
 pub(super) fn keyframe_poses(record: &RunRecord) -> Vec<StampedPose> {
-    let epoch = longest_epoch(record);
-    let pose = |k: &Keyframe| StampedPose {
-        nanos: k.capture_nanos,
-        world_from_camera: k.map_from_keyframe.rigid,
-    };
-    let of_epoch = |k: &&Keyframe| epoch.is_none_or(|epoch| k.epoch == epoch);
-    record.map.keyframes.iter().filter(of_epoch).map(pose).collect()
+    keyframes_of_longest_epoch(record).map(keyframe_pose).collect()
 }
 
 /// Position error over time, final and as published; `None` without ground truth.
@@ -286,6 +279,7 @@ mod tests {
     use super::*;
     use crate::service::results::record::{RecordedPose, RunMode};
     use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::keyframe::Keyframe;
     use crate::slam::pose::{PoseEstimate, TrackingState};
 
     #[test]

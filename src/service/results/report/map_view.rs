@@ -5,7 +5,7 @@ use std::fmt::Write;
 use nalgebra::Vector3;
 
 use crate::service::results::Results;
-use crate::service::results::poses::{final_poses, longest_epoch};
+use crate::service::results::poses::{final_poses, keyframes_of_longest_epoch, longest_epoch};
 use crate::service::results::report::html::base64;
 use crate::service::results::report::number_text::grouped;
 use crate::service::results::report::scene::{
@@ -23,12 +23,7 @@ pub fn map_view(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
     let Some(first) = map.keyframes.first().filter(|_| !results.surface.is_empty()) else {
         return String::new();
     };
-    // Each epoch has a separate world and unit.
-    let epoch = longest_epoch(results.record);
-    let keyframes: Vec<SceneKeyframe> = map
-        .keyframes
-        .iter()
-        .filter(|k| epoch.is_none_or(|epoch| k.epoch == epoch))
+    let keyframes: Vec<SceneKeyframe> = keyframes_of_longest_epoch(results.record)
         .map(|k| SceneKeyframe {
             keyframe_id: k.keyframe_id,
             nanos: k.capture_nanos,
@@ -43,6 +38,7 @@ pub fn map_view(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
         keyframe_id: None,
     };
     let points: Vec<ScenePoint> = results.surface.iter().map(scene_point).collect();
+    let epoch = longest_epoch(results.record);
     let gaps = epoch.map_or_else(Vec::new, |epoch| gaps_in(&final_poses(results.record), epoch));
     let block = pack(&SceneInput {
         points: &points,
