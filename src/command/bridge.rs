@@ -22,34 +22,6 @@ pub struct BridgeArguments {
     arguments: Vec<OsString>,
 }
 
-/// Why the bridge cannot be run.
-#[derive(Debug, thiserror::Error)]
-pub enum BridgeError {
-    /// It was not found.
-    #[error(
-        "`semidense {command}` needs {PROGRAM}, which is neither next to {own} nor on the PATH: {INSTALL_BRIDGE}"
-    )]
-    Missing {
-        /// The command that was given.
-        command: String,
-        /// This program.
-        own: PathBuf,
-    },
-    /// It has no `--set`; names the subcommand.
-    #[error(
-        "`semidense {0}` has no --set: set it in a configuration file and name that with --config"
-    )]
-    Set(&'static str),
-    /// It cannot be started.
-    #[error("cannot start {program}: {source}")]
-    Start {
-        /// The program.
-        program: PathBuf,
-        /// The system's error.
-        source: std::io::Error,
-    },
-}
-
 /// Replaces this process with `semidense-bridge COMMAND ARGUMENTS`, with the options common to all commands.
 pub fn run(
     common: &CommonArguments,
@@ -57,23 +29,33 @@ pub fn run(
     arguments: &BridgeArguments,
 ) -> CommandResult {
     if !common.set.is_empty() {
-        return Err(BridgeError::Set(command).into());
+        return Err(format!(
+            "`semidense {command}` has no --set: set it in a configuration file and name that with --config"
+        )
+        .into());
     }
     let program = bridge(command)?;
-    let source = Command::new(&program)
+    let error = Command::new(&program)
         // So that its help and its errors name the command that was typed.
         .arg0("semidense")
         .args(common.of_bridge())
         .arg(command)
         .args(&arguments.arguments)
         .exec();
-    Err(BridgeError::Start { program, source }.into())
+    Err(format!("cannot start {}: {error}", program.display()).into())
 }
 
 /// Path of the bridge, for an error that names `command`.
-pub fn bridge(command: &str) -> Result<PathBuf, BridgeError> {
+pub fn bridge(command: &str) -> Result<PathBuf, String> {
     let own = std::env::current_exe().unwrap_or_else(|_| PathBuf::from("semidense"));
-    program(&own).ok_or_else(|| BridgeError::Missing { command: command.to_owned(), own })
+    program(&own).ok_or_else(|| missing_text(command, &own))
+}
+
+fn missing_text(command: &str, own: &Path) -> String {
+    let own = own.display();
+    format!(
+        "`semidense {command}` needs {PROGRAM}, which is neither next to {own} nor on the PATH: {INSTALL_BRIDGE}"
+    )
 }
 
 /// Path of the bridge: next to our own program, with which it was installed or built, else on the `PATH`.
@@ -103,8 +85,7 @@ mod tests {
 
     #[test]
     fn the_error_for_a_missing_program_names_both_places_and_the_package() {
-        let error = BridgeError::Missing { command: "ros2".to_owned(), own: "/x/semidense".into() };
-        let error = error.to_string();
+        let error = missing_text("ros2", Path::new("/x/semidense"));
         assert!(error.contains("neither next to /x/semidense nor on the PATH"), "{error}");
         assert!(error.contains(INSTALL_BRIDGE) && INSTALL_BRIDGE.contains(PROGRAM), "{error}");
     }

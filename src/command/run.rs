@@ -15,7 +15,7 @@ use crate::command::ending::{Ending, journal_options, print_unfinished};
 use crate::command::map::MapOptions;
 use crate::command::map_points::MapPointOptions;
 use crate::command::print::note;
-use crate::command::ros2_rig::{Ros2RigError, fetch as fetch_rig};
+use crate::command::ros2_rig::fetch as fetch_rig;
 use crate::command::run_progress::start_display;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::config::{Config, MapConfig};
@@ -79,9 +79,9 @@ pub fn run(
     let output = OutputFolder::prepare(arguments.output.as_deref())?;
     let rig = match (&source, rig) {
         // A ROS 2 topic carries its own calibration.
-        (SourceName::Ros2(topic), None) => match fetch_rig(topic, output.path(), &shutdown) {
-            Err(Ros2RigError::Interrupted) => return Ok(ExitCode::from(INTERRUPTED)),
-            rig => Some(rig?),
+        (SourceName::Ros2(topic), None) => match fetch_rig(topic, output.path(), &shutdown)? {
+            None => return Ok(ExitCode::from(INTERRUPTED)),
+            rig => rig,
         },
         (_, rig) => rig,
     };
