@@ -8,7 +8,7 @@ use std::io::Read;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
-use zerocopy::{FromBytes, IntoBytes};
+use zerocopy::{FromBytes, Immutable, IntoBytes};
 
 use crate::service::bytes::take;
 use crate::service::journal::any_bytes::AnyBytes;
@@ -60,7 +60,8 @@ impl RunStart {
 }
 
 /// A step of the mapper.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, FromBytes, IntoBytes, Immutable)]
+#[repr(C, packed)]
 pub struct Step {
     /// Time it took.
     pub step_nanos: u64,
@@ -122,8 +123,7 @@ impl Record {
             }
             Self::Step(step) => {
                 log.push(Self::STEP);
-                log.extend([step.step_nanos, step.change_nanos].as_bytes());
-                log.extend(step.start_frame.as_bytes());
+                log.extend(step.as_bytes());
             }
             Self::Adjustment(adjustment) => {
                 log.push(Self::ADJUSTMENT);
@@ -157,11 +157,7 @@ impl Record {
                 return Some(Self::Keyframe(Box::new(keyframe)));
             }
             Self::POSE => Self::Pose(Box::new(take(&mut bytes)?)),
-            Self::STEP => {
-                let ([step_nanos, change_nanos], start_frame) =
-                    (take(&mut bytes)?, take(&mut bytes)?);
-                Self::Step(Step { step_nanos, change_nanos, start_frame })
-            }
+            Self::STEP => Self::Step(take(&mut bytes)?),
             Self::ADJUSTMENT => Self::Adjustment(take(&mut bytes)?),
             Self::KEYFRAME_POSE => {
                 let [epoch, keyframe_id, revision]: [u64; 3] = take(&mut bytes)?;

@@ -156,8 +156,7 @@ pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
     for point in &points {
         match detail {
             MapDetail::Full => {
-                bytes.extend(point.inverse_depth.to_le_bytes());
-                bytes.extend(point.variance.to_le_bytes());
+                bytes.extend([point.inverse_depth, point.variance].as_bytes());
                 if is_own_brightness {
                     bytes.extend(point.intensity.to_le_bytes());
                 }

@@ -20,8 +20,7 @@ pub(super) fn encode(description: &Description) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(MAX_BYTES);
     bytes.extend((features.len() as u32).to_le_bytes());
     for Feature { place, bits } in features {
-        bytes.extend(place.u.to_le_bytes());
-        bytes.extend(place.v.to_le_bytes());
+        bytes.extend([place.u, place.v].as_bytes());
         bytes.extend([place.orientation, place.scale]);
         bytes.extend(bits.as_bytes());
     }
