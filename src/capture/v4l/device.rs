@@ -3,14 +3,18 @@
 use std::fs::File;
 use std::os::fd::{AsRawFd, BorrowedFd};
 use std::path::{Path, PathBuf};
-use std::ptr::NonNull;
+use std::ptr::{NonNull, null_mut};
 
 use rustix::event::{PollFd, PollFlags, Timespec};
-use rustix::io::Errno;
+use rustix::io::{Errno, retry_on_intr};
+use rustix::mm::{MapFlags, ProtFlags, mmap, munmap};
 use rustix::time::{ClockId, clock_gettime};
 
 use super::device_name::find;
-use super::kernel::{self, KernelStruct, Request};
+use super::kernel::{
+    self, BUFFER_TYPE_CAPTURE as CAPTURE, FramePeriodEnumeration, FrameSizeEnumeration,
+    KernelStruct, MEMORY_MMAP, Request, zeroed,
+};
 use super::video_device::{
     Capability, ControlRange, Filled, FourCc, Fraction, Layout, OfferedFormat, OpenFailure,
     PeriodRange, SizeRange, VideoDevice, VideoSystem,
@@ -36,7 +40,7 @@ impl Drop for Mapping {
     fn drop(&mut self) {
         // SAFETY: `start` and `length` are those of a mapping that nobody else unmaps; slices of it
         // borrow the device that owns it.
-        unsafe { libc::munmap(self.start.as_ptr(), self.length) };
+        let _ = unsafe { munmap(self.start.as_ptr(), self.length) };
     }
 }
 
@@ -52,7 +56,7 @@ impl KernelDevice {
     pub fn open(path: &Path) -> Result<Self, Errno> {
         use rustix::fs::{Mode, OFlags};
         let flags = OFlags::RDWR | OFlags::NONBLOCK | OFlags::CLOEXEC;
-        let descriptor = retry(|| rustix::fs::open(path, flags, Mode::empty()))?;
+        let descriptor = retry_on_intr(|| rustix::fs::open(path, flags, Mode::empty()))?;
         Ok(Self { buffers: Vec::new(), file: File::from(descriptor) })
     }
 
@@ -62,7 +66,7 @@ impl KernelDevice {
         request: &Request<T>,
         structure: &mut T,
     ) -> Result<(), Errno> {
-        retry(|| {
+        retry_on_intr(|| {
             // SAFETY: the number encodes the size of `T`, which is the structure of this request, and
             // the kernel keeps no pointer to it.
             let answer = unsafe {
@@ -72,7 +76,12 @@ impl KernelDevice {
                     std::ptr::from_mut(structure),
                 )
             };
-            if answer < 0 { Err(last_error()) } else { Ok(()) }
+            let error = || std::io::Error::last_os_error();
+            if answer < 0 {
+                Err(Errno::from_io_error(&error()).unwrap_or(Errno::IO))
+            } else {
+                Ok(())
+            }
         })
     }
 
@@ -100,45 +109,16 @@ impl KernelDevice {
         let length = buffer.length as usize;
         // SAFETY: for MMAP buffers the union holds the offset.
         let offset = unsafe { buffer.place.offset };
+        let (readable, flags) = (ProtFlags::READ, MapFlags::SHARED);
         // SAFETY: a new mapping of `length` bytes, which the kernel places; nothing else is touched.
-        let start = unsafe {
-            libc::mmap(
-                std::ptr::null_mut(),
-                length,
-                libc::PROT_READ,
-                libc::MAP_SHARED,
-                self.file.as_raw_fd(),
-                offset.into(),
-            )
-        };
-        if start == libc::MAP_FAILED {
-            return Err(last_error());
-        }
-        let start = NonNull::new(start).ok_or(Errno::NOMEM)?;
+        let start = unsafe { mmap(null_mut(), length, readable, flags, &self.file, offset.into()) };
+        let start = NonNull::new(start?).ok_or(Errno::NOMEM)?;
         Ok(Mapping { start, length, is_queued: false })
     }
 }
 
-fn last_error() -> Errno {
-    Errno::from_io_error(&std::io::Error::last_os_error()).unwrap_or(Errno::IO)
-}
-
-/// Repeats a call that a signal interrupts.
-fn retry<T>(mut call: impl FnMut() -> Result<T, Errno>) -> Result<T, Errno> {
-    loop {
-        match call() {
-            Err(Errno::INTR) => {}
-            answer => return answer,
-        }
-    }
-}
-
 fn blank_buffer(index: u32) -> kernel::Buffer {
-    let mut buffer = kernel::Buffer::zeroed();
-    buffer.index = index;
-    buffer.buffer_type = kernel::BUFFER_TYPE_CAPTURE;
-    buffer.memory = kernel::MEMORY_MMAP;
-    buffer
+    kernel::Buffer { index, buffer_type: CAPTURE, memory: MEMORY_MMAP, ..zeroed() }
 }
 
 /// A text from the kernel, up to its zero byte.
@@ -168,7 +148,7 @@ fn stamp_nanos(stamp: libc::timeval) -> i64 {
 
 impl VideoDevice for KernelDevice {
     fn capability(&self) -> Result<Capability, Errno> {
-        let mut found = kernel::Capability::zeroed();
+        let mut found = zeroed::<kernel::Capability>();
         self.request(&kernel::QUERY_CAPABILITY, &mut found)?;
         let has_own = found.capabilities & kernel::CAP_DEVICE_CAPS != 0;
         Ok(Capability {
@@ -180,11 +160,7 @@ impl VideoDevice for KernelDevice {
     }
 
     fn formats(&self) -> Vec<OfferedFormat> {
-        let first = |index| {
-            let mut entry = kernel::FormatDescription::zeroed();
-            (entry.index, entry.buffer_type) = (index, kernel::BUFFER_TYPE_CAPTURE);
-            entry
-        };
+        let first = |index| kernel::FormatDescription { index, buffer_type: CAPTURE, ..zeroed() };
         self.enumerate(&kernel::ENUMERATE_FORMATS, first, |entry| OfferedFormat {
             code: FourCc(entry.pixel_format),
             description: text(&entry.description),
@@ -192,11 +168,8 @@ impl VideoDevice for KernelDevice {
     }
 
     fn sizes(&self, code: FourCc) -> Vec<SizeRange> {
-        let first = |index| {
-            let mut entry = kernel::FrameSizeEnumeration::zeroed();
-            (entry.index, entry.pixel_format) = (index, code.0);
-            entry
-        };
+        let pixel_format = code.0;
+        let first = |index| FrameSizeEnumeration { index, pixel_format, ..zeroed() };
         let mut sizes = self.enumerate(&kernel::ENUMERATE_SIZES, first, |entry| {
             let [a, b, _, d, e, _] = entry.range;
             match entry.kind {
@@ -210,12 +183,9 @@ impl VideoDevice for KernelDevice {
     }
 
     fn periods(&self, code: FourCc, width: u32, height: u32) -> Vec<PeriodRange> {
-        let first = |index| {
-            let mut entry = kernel::FramePeriodEnumeration::zeroed();
-            (entry.index, entry.pixel_format) = (index, code.0);
-            (entry.width, entry.height) = (width, height);
-            entry
-        };
+        let size_and_format =
+            FramePeriodEnumeration { pixel_format: code.0, width, height, ..zeroed() };
+        let first = |index| FramePeriodEnumeration { index, ..size_and_format };
         let mut periods = self.enumerate(&kernel::ENUMERATE_PERIODS, first, |entry| {
             let [shortest, longest, _] = entry.range;
             match entry.kind {
@@ -228,16 +198,12 @@ impl VideoDevice for KernelDevice {
     }
 
     fn set_layout(&mut self, code: FourCc, width: u32, height: u32) -> Result<Layout, Errno> {
-        let mut format = kernel::Format::zeroed();
-        format.buffer_type = kernel::BUFFER_TYPE_CAPTURE;
+        let mut format = kernel::Format { buffer_type: CAPTURE, ..zeroed() };
         // All other fields zero: a leftover stride or size would be taken for a request.
-        // SAFETY: every bit pattern is a value of every member.
-        let mut pix = unsafe { format.pix.pix };
-        (pix.width, pix.height, pix.pixel_format) = (width, height, code.0);
-        pix.field = kernel::FIELD_NONE;
-        format.pix.pix = pix;
+        let (pixel_format, field) = (code.0, kernel::FIELD_NONE);
+        format.pix.pix = kernel::PixFormat { width, height, pixel_format, field, ..zeroed() };
         self.request(&kernel::SET_FORMAT, &mut format)?;
-        // SAFETY: as above.
+        // SAFETY: every bit pattern is a value of every member.
         let pix = unsafe { format.pix.pix };
         Ok(Layout {
             code: FourCc(pix.pixel_format),
@@ -249,16 +215,14 @@ impl VideoDevice for KernelDevice {
     }
 
     fn period(&self) -> Result<(Fraction, bool), Errno> {
-        let mut parm = kernel::StreamParm::zeroed();
-        parm.buffer_type = kernel::BUFFER_TYPE_CAPTURE;
+        let mut parm = kernel::StreamParm { buffer_type: CAPTURE, ..zeroed() };
         self.request(&kernel::GET_PARM, &mut parm)?;
         Ok((parm.time_per_frame, parm.capability & kernel::CAP_TIME_PER_FRAME != 0))
     }
 
     fn set_period(&mut self, period: Fraction) -> Result<Fraction, Errno> {
-        let mut parm = kernel::StreamParm::zeroed();
-        parm.buffer_type = kernel::BUFFER_TYPE_CAPTURE;
-        parm.time_per_frame = period;
+        let mut parm =
+            kernel::StreamParm { buffer_type: CAPTURE, time_per_frame: period, ..zeroed() };
         self.request(&kernel::SET_PARM, &mut parm)?;
         Ok(parm.time_per_frame)
     }
@@ -267,8 +231,7 @@ impl VideoDevice for KernelDevice {
         let mut found: Vec<ControlRange> = Vec::new();
         let mut id = 0;
         for _ in 0..MAX_ENTRIES {
-            let mut query = kernel::QueryControl::zeroed();
-            query.id = id | kernel::CONTROL_NEXT;
+            let mut query = kernel::QueryControl { id: id | kernel::CONTROL_NEXT, ..zeroed() };
             if self.request(&kernel::QUERY_CONTROL, &mut query).is_err() || query.id <= id {
                 break;
             }
@@ -287,8 +250,7 @@ impl VideoDevice for KernelDevice {
             return Vec::new();
         };
         let item = |index| {
-            let mut menu = kernel::QueryMenu::zeroed();
-            (menu.id, menu.index) = (control.id, index);
+            let mut menu = kernel::QueryMenu { id: control.id, index, ..zeroed() };
             self.request(&kernel::QUERY_MENU, &mut menu).ok()?;
             let bytes = menu.name;
             let [a, b, c, d, e, f, g, h, ..] = bytes;
@@ -303,8 +265,7 @@ impl VideoDevice for KernelDevice {
     }
 
     fn control(&self, id: u32) -> Option<ControlRange> {
-        let mut query = kernel::QueryControl::zeroed();
-        query.id = id;
+        let mut query = kernel::QueryControl { id, ..zeroed() };
         self.request(&kernel::QUERY_CONTROL, &mut query).ok()?;
         (query.flags & kernel::CONTROL_DISABLED == 0).then(|| control_range(&query))
     }
@@ -320,10 +281,8 @@ impl VideoDevice for KernelDevice {
     }
 
     fn make_buffers(&mut self, count: u32) -> Result<usize, Errno> {
-        let mut wish = kernel::RequestBuffers::zeroed();
-        wish.count = count;
-        wish.buffer_type = kernel::BUFFER_TYPE_CAPTURE;
-        wish.memory = kernel::MEMORY_MMAP;
+        let (buffer_type, memory) = (CAPTURE, MEMORY_MMAP);
+        let mut wish = kernel::RequestBuffers { count, buffer_type, memory, ..zeroed() };
         self.buffers.clear();
         self.request(&kernel::REQUEST_BUFFERS, &mut wish)?;
         if count > 0 {
@@ -362,7 +321,7 @@ impl VideoDevice for KernelDevice {
     }
 
     fn start(&mut self) -> Result<(), Errno> {
-        let mut buffer_type = kernel::BUFFER_TYPE_CAPTURE as i32;
+        let mut buffer_type = CAPTURE as i32;
         self.request(&kernel::STREAM_ON, &mut buffer_type)
     }
 
@@ -388,7 +347,7 @@ impl VideoDevice for KernelDevice {
 
 impl Drop for KernelDevice {
     fn drop(&mut self) {
-        let mut buffer_type = kernel::BUFFER_TYPE_CAPTURE as i32;
+        let mut buffer_type = CAPTURE as i32;
         // Closing ends the stream too; a device that is gone refuses, which changes nothing.
         let _ = self.request(&kernel::STREAM_OFF, &mut buffer_type);
     }

@@ -55,69 +55,31 @@ pub const CONTROL_TYPE_INTEGER_MENU: u32 = 9;
 /// `V4L2_FRMSIZE_TYPE_DISCRETE` and `V4L2_FRMIVAL_TYPE_DISCRETE`.
 pub const ENUMERATION_DISCRETE: u32 = 1;
 
-/// `struct v4l2_capability`.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct Capability {
-    pub driver: [u8; 16],
-    pub card: [u8; 32],
-    pub bus_info: [u8; 32],
-    pub version: u32,
-    pub capabilities: u32,
-    pub device_caps: u32,
-    pub reserved: [u32; 3],
+/// A kernel structure: plain numbers, for which all-zero bits are a value.
+///
+/// # Safety
+/// The type is `repr(C)` and every bit pattern of it is valid.
+pub unsafe trait KernelStruct: Copy {}
+
+/// A structure with all bits zero, as the interface requires of reserved fields.
+pub fn zeroed<T: KernelStruct>() -> T {
+    // SAFETY: by the trait's contract every bit pattern is a value.
+    unsafe { std::mem::zeroed() }
 }
 
-/// `struct v4l2_fmtdesc`.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct FormatDescription {
-    pub index: u32,
-    pub buffer_type: u32,
-    pub flags: u32,
-    pub description: [u8; 32],
-    pub pixel_format: u32,
-    pub media_bus_code: u32,
-    pub reserved: [u32; 3],
-}
+// SAFETY: an integer.
+unsafe impl KernelStruct for i32 {}
 
-/// `struct v4l2_pix_format`.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct PixFormat {
-    pub width: u32,
-    pub height: u32,
-    pub pixel_format: u32,
-    pub field: u32,
-    pub bytes_per_line: u32,
-    pub size_image: u32,
-    pub colorspace: u32,
-    pub private: u32,
-    pub flags: u32,
-    pub encoding: u32,
-    pub quantization: u32,
-    pub transfer_function: u32,
-}
+macro_rules! kernel_structs {
+    ($($(#[$about:meta])* $kind:ident $name:ident { $($field:ident: $type:ty),* $(,)? })*) => { $(
+        $(#[$about])*
+        #[repr(C)]
+        #[derive(Clone, Copy)]
+        pub $kind $name { $(pub $field: $type),* }
 
-/// Bytes of the unions in [`Format`] and [`StreamParm`].
-const UNION_BYTES: usize = 200;
-
-/// `struct v4l2_format` with the single-plane member of its union. The union holds pointers, so it is aligned like one.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct Format {
-    pub buffer_type: u32,
-    pub pix: FormatUnion,
-}
-
-/// The union of `struct v4l2_format`.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub union FormatUnion {
-    pub pix: PixFormat,
-    pub raw: [u8; UNION_BYTES],
-    /// Gives the union the alignment of its members with pointers.
-    pub pointer: usize,
+        // SAFETY: `repr(C)` structures of integers, and unions of them.
+        unsafe impl KernelStruct for $name {}
+    )* };
 }
 
 /// `struct v4l2_fract`: a frame period in seconds.
@@ -130,160 +92,121 @@ pub struct Fraction {
     pub denominator: u32,
 }
 
-/// `struct v4l2_streamparm` with the capture member of its union.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct StreamParm {
-    pub buffer_type: u32,
-    pub capability: u32,
-    pub capture_mode: u32,
-    pub time_per_frame: Fraction,
-    pub extended_mode: u32,
-    pub read_buffers: u32,
-    pub reserved: [u32; 4],
-    pub rest: [u8; UNION_BYTES - 40],
-}
+/// Bytes of the unions in [`Format`] and [`StreamParm`].
+const UNION_BYTES: usize = 200;
 
-/// `struct v4l2_requestbuffers`.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct RequestBuffers {
-    pub count: u32,
-    pub buffer_type: u32,
-    pub memory: u32,
-    pub capabilities: u32,
-    pub flags: u8,
-    pub reserved: [u8; 3],
-}
+// The last fields of a structure, of which none is used, are one: `rest`.
+kernel_structs! {
+    /// `struct v4l2_capability`.
+    struct Capability {
+        driver: [u8; 16],
+        card: [u8; 32],
+        bus_info: [u8; 32],
+        version: u32,
+        capabilities: u32,
+        device_caps: u32,
+        rest: [u32; 3],
+    }
 
-/// `struct v4l2_timecode`.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct TimeCode {
-    pub kind: u32,
-    pub flags: u32,
-    pub digits: [u8; 4],
-    pub user_bits: [u8; 4],
-}
+    /// `struct v4l2_fmtdesc`.
+    struct FormatDescription {
+        index: u32,
+        buffer_type: u32,
+        flags: u32,
+        description: [u8; 32],
+        pixel_format: u32,
+        rest: [u32; 4],
+    }
 
-/// `struct v4l2_buffer`.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct Buffer {
-    pub index: u32,
-    pub buffer_type: u32,
-    pub bytes_used: u32,
-    pub flags: u32,
-    pub field: u32,
-    pub timestamp: libc::timeval,
-    pub time_code: TimeCode,
-    pub sequence: u32,
-    pub memory: u32,
-    pub place: BufferUnion,
-    pub length: u32,
-    pub reserved: u32,
-    pub request: i32,
-}
+    /// `struct v4l2_pix_format`.
+    struct PixFormat {
+        width: u32,
+        height: u32,
+        pixel_format: u32,
+        field: u32,
+        bytes_per_line: u32,
+        rest: [u32; 7],
+    }
 
-/// The union `m` of `struct v4l2_buffer`.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub union BufferUnion {
-    /// MMAP: the offset for `mmap`.
-    pub offset: u32,
-    pub pointer: usize,
-}
+    /// `struct v4l2_format` with the single-plane member of its union. The union holds pointers, so it is aligned like
+    /// one.
+    struct Format { buffer_type: u32, pix: FormatUnion }
 
-/// `struct v4l2_control`.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct Control {
-    pub id: u32,
-    pub value: i32,
-}
+    /// The union of `struct v4l2_format`; `pointer` gives it the alignment of its members with pointers.
+    union FormatUnion { pix: PixFormat, raw: [u8; UNION_BYTES], pointer: usize }
 
-/// `struct v4l2_queryctrl`.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct QueryControl {
-    pub id: u32,
-    pub kind: u32,
-    pub name: [u8; 32],
-    pub minimum: i32,
-    pub maximum: i32,
-    pub step: i32,
-    pub default: i32,
-    pub flags: u32,
-    pub reserved: [u32; 2],
-}
+    /// `struct v4l2_streamparm` with the capture member of its union.
+    struct StreamParm {
+        buffer_type: u32,
+        capability: u32,
+        capture_mode: u32,
+        time_per_frame: Fraction,
+        rest: [u8; UNION_BYTES - 16],
+    }
 
-/// `struct v4l2_querymenu`, packed; the name of an item, or its value (the first eight bytes).
-#[repr(C, packed)]
-#[derive(Clone, Copy)]
-pub struct QueryMenu {
-    pub id: u32,
-    pub index: u32,
-    pub name: [u8; 32],
-    pub reserved: u32,
-}
+    /// `struct v4l2_requestbuffers`.
+    struct RequestBuffers { count: u32, buffer_type: u32, memory: u32, rest: [u32; 2] }
 
-/// `struct v4l2_frmsizeenum`: discrete sizes hold `range[0]` × `range[1]`, others min, max and step of
-/// the width, then of the height.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct FrameSizeEnumeration {
-    pub index: u32,
-    pub pixel_format: u32,
-    pub kind: u32,
-    pub range: [u32; 6],
-    pub reserved: [u32; 2],
-}
+    /// `struct v4l2_buffer`.
+    struct Buffer {
+        index: u32,
+        buffer_type: u32,
+        bytes_used: u32,
+        flags: u32,
+        field: u32,
+        timestamp: libc::timeval,
+        time_code: [u32; 4],
+        sequence: u32,
+        memory: u32,
+        place: BufferUnion,
+        length: u32,
+        rest: [u32; 2],
+    }
 
-/// `struct v4l2_frmivalenum`: discrete periods hold `range[0]`, others min, max and step.
-#[repr(C)]
-#[derive(Clone, Copy)]
-pub struct FramePeriodEnumeration {
-    pub index: u32,
-    pub pixel_format: u32,
-    pub width: u32,
-    pub height: u32,
-    pub kind: u32,
-    pub range: [Fraction; 3],
-    pub reserved: [u32; 2],
-}
+    /// The union `m` of `struct v4l2_buffer`; for MMAP, the offset for `mmap`.
+    union BufferUnion { offset: u32, pointer: usize }
 
-/// A kernel structure: plain numbers, for which all-zero bits are a value.
-///
-/// # Safety
-/// The type is `repr(C)` and every bit pattern of it is valid.
-pub unsafe trait KernelStruct: Copy {
-    /// All bits zero, as the interface requires of reserved fields.
-    fn zeroed() -> Self {
-        // SAFETY: by the trait's contract every bit pattern is a value.
-        unsafe { std::mem::zeroed() }
+    /// `struct v4l2_control`.
+    struct Control { id: u32, value: i32 }
+
+    /// `struct v4l2_queryctrl`.
+    struct QueryControl {
+        id: u32,
+        kind: u32,
+        name: [u8; 32],
+        minimum: i32,
+        maximum: i32,
+        step: i32,
+        default: i32,
+        flags: u32,
+        rest: [u32; 2],
+    }
+
+    /// `struct v4l2_querymenu`, packed; the name of an item, or its value (the first eight bytes).
+    #[repr(packed)]
+    struct QueryMenu { id: u32, index: u32, name: [u8; 32], rest: u32 }
+
+    /// `struct v4l2_frmsizeenum`: discrete sizes hold `range[0]` × `range[1]`, others min, max and step of
+    /// the width, then of the height.
+    struct FrameSizeEnumeration {
+        index: u32,
+        pixel_format: u32,
+        kind: u32,
+        range: [u32; 6],
+        rest: [u32; 2],
+    }
+
+    /// `struct v4l2_frmivalenum`: discrete periods hold `range[0]`, others min, max and step.
+    struct FramePeriodEnumeration {
+        index: u32,
+        pixel_format: u32,
+        width: u32,
+        height: u32,
+        kind: u32,
+        range: [Fraction; 3],
+        rest: [u32; 2],
     }
 }
-
-macro_rules! kernel_structs {
-    ($($name:ty),*) => { $(
-        // SAFETY: `repr(C)` structures of integers, and unions of them.
-        unsafe impl KernelStruct for $name {}
-    )* };
-}
-kernel_structs!(
-    Capability,
-    FormatDescription,
-    Format,
-    StreamParm,
-    RequestBuffers,
-    Buffer,
-    Control,
-    QueryControl,
-    QueryMenu,
-    FrameSizeEnumeration,
-    FramePeriodEnumeration,
-    i32
-);
 
 /// A request to the driver, with the structure that it takes.
 pub struct Request<T> {
