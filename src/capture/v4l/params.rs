@@ -6,6 +6,7 @@ use serde::de::{self, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
 
 use super::pixel_format::PixelFormat;
+use super::video_device::FourCc;
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// A setting that the camera can also control automatically.
@@ -55,42 +56,33 @@ impl<'de> Deserialize<'de> for Setting {
 /// The format requested of a camera.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[repr(u32)]
 pub enum FormatChoice {
     /// The cheapest to convert that reaches the rate.
     #[default]
-    Auto,
+    Auto = 0,
     /// 8-bit grey.
-    Grey,
+    Grey = PixelFormat::Grey as u32,
     /// 10-bit grey in 16.
-    Y10,
+    Y10 = PixelFormat::Y10 as u32,
     /// 12-bit grey in 16.
-    Y12,
+    Y12 = PixelFormat::Y12 as u32,
     /// 16-bit grey.
-    Y16,
+    Y16 = PixelFormat::Y16 as u32,
     /// Packed 4:2:2, luma first.
-    Yuyv,
+    Yuyv = PixelFormat::Yuyv as u32,
     /// Packed 4:2:2, chroma first.
-    Uyvy,
+    Uyvy = PixelFormat::Uyvy as u32,
     /// Planar 4:2:0.
-    Nv12,
+    Nv12 = PixelFormat::Nv12 as u32,
     /// Motion JPEG.
-    Mjpeg,
+    Mjpeg = PixelFormat::Mjpeg as u32,
 }
 
 impl FormatChoice {
     /// The format, if one is named.
     pub fn format(self) -> Option<PixelFormat> {
-        match self {
-            Self::Auto => None,
-            Self::Grey => Some(PixelFormat::Grey),
-            Self::Y10 => Some(PixelFormat::Y10),
-            Self::Y12 => Some(PixelFormat::Y12),
-            Self::Y16 => Some(PixelFormat::Y16),
-            Self::Yuyv => Some(PixelFormat::Yuyv),
-            Self::Uyvy => Some(PixelFormat::Uyvy),
-            Self::Nv12 => Some(PixelFormat::Nv12),
-            Self::Mjpeg => Some(PixelFormat::Mjpeg),
-        }
+        PixelFormat::of(FourCc(self as u32))
     }
 }
 

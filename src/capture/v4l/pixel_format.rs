@@ -7,27 +7,28 @@ use crate::slam::image::gray::{gray_from_interleaved, gray_from_rgb};
 
 /// A format that can be converted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u32)]
 pub enum PixelFormat {
     /// 8-bit grey.
-    Grey,
+    Grey = FourCc::new(b"GREY").0,
     /// A plane of luma, then one of chroma (4:2:0).
-    Nv12,
+    Nv12 = FourCc::new(b"NV12").0,
     /// Alternating luma and chroma (4:2:2), luma first.
-    Yuyv,
+    Yuyv = FourCc::new(b"YUYV").0,
     /// The same, chroma first.
-    Uyvy,
+    Uyvy = FourCc::new(b"UYVY").0,
     /// 10 bits of grey in two bytes, little-endian.
-    Y10,
+    Y10 = FourCc::new(b"Y10 ").0,
     /// 12 bits of grey in two bytes.
-    Y12,
+    Y12 = FourCc::new(b"Y12 ").0,
     /// 16 bits of grey.
-    Y16,
+    Y16 = FourCc::new(b"Y16 ").0,
     /// Red, green, blue, a byte each.
-    Rgb3,
+    Rgb3 = FourCc::new(b"RGB3").0,
     /// The same, blue first.
-    Bgr3,
+    Bgr3 = FourCc::new(b"BGR3").0,
     /// A JPEG for each frame.
-    Mjpeg,
+    Mjpeg = FourCc::new(b"MJPG").0,
 }
 
 impl PixelFormat {
@@ -47,18 +48,7 @@ impl PixelFormat {
 
     /// Its code.
     pub const fn code(self) -> FourCc {
-        FourCc::new(match self {
-            Self::Grey => b"GREY",
-            Self::Nv12 => b"NV12",
-            Self::Yuyv => b"YUYV",
-            Self::Uyvy => b"UYVY",
-            Self::Y10 => b"Y10 ",
-            Self::Y12 => b"Y12 ",
-            Self::Y16 => b"Y16 ",
-            Self::Rgb3 => b"RGB3",
-            Self::Bgr3 => b"BGR3",
-            Self::Mjpeg => b"MJPG",
-        })
+        FourCc(self as u32)
     }
 
     /// The format of a code.
