@@ -28,6 +28,10 @@ impl Wave {
     }
 }
 
+fn wave(amplitude: f64, rate: f64, phase: f64) -> Wave {
+    Wave { amplitude, rate, phase }
+}
+
 fn sum(waves: &[Wave], phase: f64) -> f64 {
     waves.iter().map(|w| w.at(phase)).sum()
 }
@@ -165,24 +169,15 @@ fn walk_waves(stage: &Stage, kind: MotionKind, stream: &mut Stream) -> [Vec<Wave
     match kind {
         // An ellipse that the slower and faster waves keep from closing.
         MotionKind::Handheld => [
-            vec![
-                Wave { amplitude: 0.86 * x, rate: 1.0, phase: start },
-                Wave { amplitude: 0.10 * x, rate: 2.236, phase: phase() },
-            ],
-            vec![
-                Wave { amplitude: 0.82 * y, rate: 1.0, phase: start + 1.4 },
-                Wave { amplitude: 0.14 * y, rate: 1.618, phase: phase() },
-            ],
-            vec![
-                Wave { amplitude: 0.60 * z, rate: 1.272, phase: phase() },
-                Wave { amplitude: 0.35 * z, rate: 2.899, phase: phase() },
-            ],
+            vec![wave(0.86 * x, 1.0, start), wave(0.10 * x, 2.236, phase())],
+            vec![wave(0.82 * y, 1.0, start + 1.4), wave(0.14 * y, 1.618, phase())],
+            vec![wave(0.60 * z, 1.272, phase()), wave(0.35 * z, 2.899, phase())],
         ],
         MotionKind::Straight => {
             // Across the mean viewing direction.
             let (sin, cos) = stage.heading_rad.sin_cos();
             let reach = x.min(y);
-            let along = |share: f64| vec![Wave { amplitude: share * reach, rate: 1.0, phase: 0.0 }];
+            let along = |share: f64| vec![wave(share * reach, 1.0, 0.0)];
             [along(sin), along(-cos), vec![]]
         }
         MotionKind::Rotation | MotionKind::Standing => [vec![], vec![], vec![]],
@@ -198,15 +193,9 @@ fn turn_waves(stage: &Stage, kind: MotionKind, stream: &mut Stream) -> [Vec<Wave
     let mut phase = || stream.uniform_f64(0.0, std::f64::consts::TAU);
     let (heading, elevation) = (stage.heading_swing_rad, stage.elevation_swing_rad);
     [
-        vec![
-            Wave { amplitude: 0.82 * heading, rate: 1.0, phase: phase() },
-            Wave { amplitude: 0.16 * heading, rate: 2.147, phase: phase() },
-        ],
-        vec![
-            Wave { amplitude: 0.62 * elevation, rate: 1.539, phase: phase() },
-            Wave { amplitude: 0.36 * elevation, rate: 0.7, phase: phase() },
-        ],
-        vec![Wave { amplitude: ROLL_RAD, rate: 1.1, phase: phase() }],
+        vec![wave(0.82 * heading, 1.0, phase()), wave(0.16 * heading, 2.147, phase())],
+        vec![wave(0.62 * elevation, 1.539, phase()), wave(0.36 * elevation, 0.7, phase())],
+        vec![wave(ROLL_RAD, 1.1, phase())],
     ]
 }
 
