@@ -54,27 +54,15 @@ const EXPOSURE: Knob = Knob {
     values: &[EXPOSURE_ABSOLUTE],
     units_per_step: EXPOSURE_STEP_MICROS,
 };
-const GAIN_KNOB: Knob = Knob {
-    key: "gain",
-    name: "gain",
-    auto: (AUTO_GAIN, &[1], 0),
-    values: &[GAIN, ANALOGUE_GAIN],
-    units_per_step: 1,
-};
-const WHITE_BALANCE: Knob = Knob {
-    key: "white_balance_k",
-    name: "colour temperature",
-    auto: (AUTO_WHITE_BALANCE, &[1], 0),
-    values: &[WHITE_BALANCE_TEMPERATURE],
-    units_per_step: 1,
-};
-const FOCUS: Knob = Knob {
-    key: "focus",
-    name: "focus",
-    auto: (FOCUS_AUTO, &[1], 0),
-    values: &[FOCUS_ABSOLUTE],
-    units_per_step: 1,
-};
+const GAIN_KNOB: Knob = knob("gain", "gain", AUTO_GAIN, &[GAIN, ANALOGUE_GAIN]);
+const WHITE_BALANCE: Knob =
+    knob("white_balance_k", "colour temperature", AUTO_WHITE_BALANCE, &[WHITE_BALANCE_TEMPERATURE]);
+const FOCUS: Knob = knob("focus", "focus", FOCUS_AUTO, &[FOCUS_ABSOLUTE]);
+
+/// A knob in the units of its control, whose automatic mode is on or off.
+const fn knob(key: &'static str, name: &'static str, auto: u32, values: &'static [u32]) -> Knob {
+    Knob { key, name, auto: (auto, &[1], 0), values, units_per_step: 1 }
+}
 
 /// The settings with their knobs.
 fn settings(params: &CameraParams) -> [(Setting, Knob); 4] {
@@ -148,14 +136,10 @@ impl Knob {
         if self.is_automatic(device) {
             return Ok(());
         }
-        let mut answer = Err(Errno::INVAL);
-        for &value in on {
-            answer = device.set_value(id, value);
-            if answer.is_ok() {
-                break;
-            }
-        }
-        answer.map_err(|error| self.refused(error))
+        let tried = on.iter().fold(Err(Errno::INVAL), |answer, &value| {
+            answer.or_else(|_| device.set_value(id, value))
+        });
+        tried.map_err(|error| self.refused(error))
     }
 
     fn manual(&self, device: &mut dyn VideoDevice) -> Result<(), String> {

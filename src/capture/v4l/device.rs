@@ -92,15 +92,8 @@ impl KernelDevice {
         first: impl Fn(u32) -> T,
         read: impl Fn(&T) -> R,
     ) -> Vec<R> {
-        let mut found = Vec::new();
-        for index in 0..MAX_ENTRIES {
-            let mut entry = first(index);
-            if self.request(request, &mut entry).is_err() {
-                break;
-            }
-            found.push(read(&entry));
-        }
-        found
+        let answer = |mut entry: T| self.request(request, &mut entry).ok().map(|()| read(&entry));
+        (0..MAX_ENTRIES).map(first).map_while(answer).collect()
     }
 
     fn map(&self, index: u32) -> Result<Mapping, Errno> {
