@@ -23,6 +23,7 @@ mod rectifier;
 pub mod rig;
 pub mod rig_error;
 pub mod ros_image;
+pub mod ros_topic;
 pub mod sensor_yaml;
 pub mod simulator;
 pub mod source;

@@ -14,6 +14,7 @@ use ros2_client::MessageInfo;
 use ros2_client::dds::Subscription;
 use rustix::event::{PollFd, PollFlags, poll};
 use rustix::stdio::stdout;
+use semidense::capture::ros_topic::{camera_topic, is_rectified};
 use semidense::capture::stream::format::StreamHeader;
 use semidense::service::shutdown::Shutdown;
 use serde::de::DeserializeOwned;
@@ -21,7 +22,7 @@ use serde::de::DeserializeOwned;
 use crate::ros::encoder::realtime_nanos;
 use crate::ros::message::{CameraInfo, CompressedImage, Image, RosMessage, Time};
 use crate::ros::topic::{self, RosTopic};
-use crate::ros2::camera_rig::{CameraRigError, camera_info_topic, is_rectified, rig_text};
+use crate::ros2::camera_rig::{CameraRigError, rig_text};
 use crate::ros2::image_source::{GrayFrame, ImageError};
 use crate::ros2::node::{NodeError, RosNode};
 
@@ -71,7 +72,7 @@ pub fn await_rig(
     longest: Duration,
     shutdown: &Shutdown,
 ) -> Result<String, CameraError> {
-    let topic = camera_info.map_or_else(|| camera_info_topic(images), str::to_owned);
+    let topic = camera_info.map_or_else(|| camera_topic(images), str::to_owned);
     let infos = node.subscription::<CameraInfo>(SENSOR, &topic)?;
     let begin = Instant::now();
     loop {

@@ -28,19 +28,6 @@ pub enum CameraRigError {
     Rig(#[from] RigError),
 }
 
-/// The CameraInfo topic for images: next to the image topic, as in `image_transport`.
-pub fn camera_info_topic(images: &str) -> String {
-    let images = images.strip_suffix("/compressed").unwrap_or(images);
-    let folder = images.rsplit_once('/').map_or("", |(folder, _)| folder);
-    format!("{folder}/camera_info")
-}
-
-/// Whether a topic carries rectified images, whose camera is the matrix P without a lens.
-pub fn is_rectified(images: &str) -> bool {
-    let images = images.strip_suffix("/compressed").unwrap_or(images);
-    images.rsplit('/').next().is_some_and(|name| name.contains("rect"))
-}
-
 /// The text of a rig file, validated; `topic` is the origin of `info`.
 pub fn rig_text(
     info: &CameraInfo,
@@ -145,13 +132,5 @@ mod tests {
         assert!(words(CameraInfo { binning_x: 2, ..info("plumb_bob", &[]) }).contains("binned"));
         assert!(words(info("plumb_bob", &[f64::NAN; 5])).contains("coefficients"));
         assert!(words(CameraInfo { width: 0, ..info("plumb_bob", &[]) }).contains("width"));
-    }
-
-    #[test]
-    fn the_camera_info_is_next_to_its_images() {
-        assert_eq!(camera_info_topic("/camera/image_raw"), "/camera/camera_info");
-        assert_eq!(camera_info_topic("/a/b/image_rect/compressed"), "/a/b/camera_info");
-        assert_eq!(camera_info_topic("/image"), "/camera_info");
-        assert!(is_rectified("/a/image_rect/compressed") && !is_rectified("/rect/image_raw"));
     }
 }

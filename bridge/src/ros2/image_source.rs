@@ -1,6 +1,6 @@
 //! Converts ROS images to frames of a stream for capture.
 
-use semidense::capture::decode_error::DecodeError;
+use semidense::capture::decode_error::{DecodeError, MAX_SIDE};
 use semidense::capture::image_file::{decode_gray_into, image_size};
 use semidense::capture::ros_image::{RosImage, RosImageError};
 use semidense::capture::stream::format::{StreamClock, StreamHeader};
@@ -37,9 +37,6 @@ pub struct GrayFrame {
     samples: Vec<u8>,
     size: (u32, u32),
 }
-
-/// Upper limit for the sides of an image, as for a rig, pixels.
-const MAX_SIDE: usize = 8192;
 
 impl GrayFrame {
     fn resize(&mut self, width: usize, height: usize) -> Result<(), ImageError> {

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use crate::capture::bag::message::CameraInfo;
-use crate::capture::bag::topics::is_rectified;
 use crate::capture::rig::{LensModel, Rig, RigFile};
+use crate::capture::ros_topic::is_rectified;
 
 /// Maximum number of non-zero lens coefficients: those of the rational model after the eighth describe a thin prism and
 /// a tilt, which no rig has.

@@ -7,10 +7,9 @@ use crate::capture::bag::bag_error::BagError;
 use crate::capture::bag::camera::rig_of;
 use crate::capture::bag::message::{CameraInfo, Stamped, decode};
 use crate::capture::bag::records::{Place, Records};
-use crate::capture::bag::topics::{
-    Channel, Channels, Kind, camera_topic, frame_record_topic, listed,
-};
+use crate::capture::bag::topics::{Channel, Channels, Kind, listed};
 use crate::capture::rig::Rig;
+use crate::capture::ros_topic::{camera_topic, frame_record_topic};
 
 /// The part of a file that is played.
 #[derive(Debug)]

@@ -47,31 +47,6 @@ pub struct Channel {
 /// The channels by their numbers.
 pub type Channels = BTreeMap<u16, Channel>;
 
-/// The topic of the camera that belongs to images on `topic`: by ROS convention `camera_info` next to it.
-pub fn camera_topic(topic: &str) -> String {
-    beside(topic, "camera_info")
-}
-
-/// The topic of our own recording's stamps for images on `topic`.
-pub fn frame_record_topic(topic: &str) -> String {
-    beside(topic, "details/frame")
-}
-
-fn beside(topic: &str, name: &str) -> String {
-    let namespace = base_topic(topic).rsplit_once('/').map_or("", |(namespace, _)| namespace);
-    format!("{namespace}/{name}")
-}
-
-/// Whether the images on `topic` are already rectified, judging by its name (`image_rect`, `image_rect_color`).
-pub fn is_rectified(topic: &str) -> bool {
-    base_topic(topic).rsplit('/').next().is_some_and(|name| name.contains("rect"))
-}
-
-/// The topic without the name that `image_transport` adds.
-fn base_topic(topic: &str) -> &str {
-    topic.strip_suffix("/compressed").unwrap_or(topic)
-}
-
 /// Topics as a list for an error.
 pub fn listed<'a>(topics: impl Iterator<Item = &'a str>) -> String {
     /// A longer list would not be read.
