@@ -1,16 +1,15 @@
 //! The camera's path so far, each pose relative to its keyframe, so that it follows corrections of the map.
 
 use semidense::slam::pose::NO_KEYFRAME;
+use zerocopy::{Immutable, IntoBytes};
 
 use crate::session::Pose;
 
 /// Upper limit for the poses kept: half an hour at 30 Hz. Beyond it, every second one is removed.
 const MAX_POSES: usize = 1 << 16;
-/// Bytes of a pose in a message.
-const POSE_BYTES: usize = 32;
-
-/// A pose of the path.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// A pose of the path, as it is in a message.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, IntoBytes, Immutable)]
 struct PathPose {
     secs: f64,
     position_in_keyframe: [f32; 3],
@@ -68,17 +67,6 @@ impl Path {
 
     /// The poses from index `from`: seconds f64, position f32 x 3, keyframe, epoch and state u32.
     pub fn bytes_from(&self, from: usize) -> Vec<u8> {
-        let poses = self.poses.get(from..).unwrap_or_default();
-        let mut bytes = Vec::with_capacity(poses.len() * POSE_BYTES);
-        for pose in poses {
-            bytes.extend_from_slice(&pose.secs.to_le_bytes());
-            pose.position_in_keyframe
-                .iter()
-                .for_each(|x| bytes.extend_from_slice(&x.to_le_bytes()));
-            for number in [pose.keyframe_id, pose.epoch, pose.state] {
-                bytes.extend_from_slice(&number.to_le_bytes());
-            }
-        }
-        bytes
+        self.poses.get(from..).unwrap_or_default().as_bytes().to_vec()
     }
 }
