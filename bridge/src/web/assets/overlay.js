@@ -51,7 +51,7 @@ const Overlay = (() => {
   return class Overlay {
     /** `clusterOf` gives the points of a keyframe by its id. */
     constructor(canvas, clusterOf) {
-      this.canvas = canvas; this.clusterOf = clusterOf; this.mode = "depth"; this.frame = null; this.cluster = null; this.images = 0;
+      this.canvas = canvas; this.clusterOf = clusterOf; this.mode = "depth"; this.frame = null; this.cluster = null; this.images = 0; this.maxSigma = 1;
       this.start();
       canvas.addEventListener("webglcontextlost", (e) => { e.preventDefault(); this.gl = null; });
       canvas.addEventListener("webglcontextrestored", () => { this.start(); this.draw(); });
@@ -98,10 +98,9 @@ const Overlay = (() => {
       const cluster = this.clusterOf(pose.keyframe);
       return cluster ? { pose, cluster } : null;
     }
-    draw(maxSigma = 1) {
+    draw() {
       const gl = this.gl;
       if (!gl || !this.frame) return;
-      this.maxSigma = maxSigma === 1 ? this.maxSigma || 1 : maxSigma;
       const found = this.mode === "off" ? null : this.poseOfFrame();
       gl.viewport(0, 0, this.canvas.width, this.canvas.height);
       gl.disable(gl.BLEND); gl.useProgram(this.image); gl.uniform1f(this.dim, found ? 0.62 : 1);

@@ -10,7 +10,7 @@ const grouped = (n) => Math.round(n).toString().replace(/\B(?=(\d{3})+$)/g, " ")
 const short = (n) => n >= 1e6 ? `${(n / 1e6).toFixed(2)} M` : n >= 1e4 ? `${Math.round(n / 1e3)} k` : grouped(n);
 
 let viewer, overlay, socket, tries = 0, isFinished = false;
-const seen = { poses: 0, keyframes: 0, frames: 0, places: 0, run: null, joined: false, pose: null, health: {}, instance: "", lastPose: 0 };
+const seen = { poses: 0, run: null, joined: false, pose: null, health: {}, instance: "", lastPose: 0 };
 
 // ---- theme ------------------------------------------------------------------------------------------------------
 function setTheme(theme) {
@@ -62,7 +62,7 @@ const handlers = {
     if (seen.run !== m.run) {
       seen.run = m.run;
       viewer.clear(); overlay.clear(); Charts.forget();
-      Object.assign(seen, { pose: null, health: {}, keyframes: 0 });
+      Object.assign(seen, { pose: null, health: {} });
     }
     seen.joined = m.joined; seen.known = m.keyframes; seen.note = m.note;
     if (m.active !== null) viewer.setActive(m.active);
@@ -93,7 +93,6 @@ const handlers = {
     const known = new Set();
     for (const [epoch, places] of list) { viewer.setPlaces(places, epoch); for (const [id] of places) known.add(id); }
     for (const id of [...viewer.clusters.keys()]) if (!known.has(id)) viewer.removeCluster(id);
-    seen.places = known.size;
   },
   path(m, data, at) {
     const view = new DataView(data);
@@ -111,12 +110,10 @@ const handlers = {
     const hadPlace = viewer.places.has(m.id);
     viewer.setCluster(cluster);
     if (!hadPlace) viewer.places.delete(m.id);
-    seen.keyframes++;
     say({ ack: 1 });
     figures();
   },
   frame(m, data, at) {
-    seen.frames++;
     overlay.setFrame(m, new Uint8Array(data, at)).then(() => cameraNote(m)).catch((error) => console.error(error)).finally(() => say({ ack: 1 }));
   },
 };
