@@ -6,31 +6,6 @@ use crate::ros::message::{
 };
 use crate::ros::own_message::{FrameRecord, GraphRecord, KeyframeRecord, PoseRecord};
 
-/// Names the types of the messages that have a topic.
-macro_rules! types {
-    ($($message:ident $name:literal),* $(,)?) => {$(
-        impl RosMessage for $message {
-            const TYPE: &'static str = $name;
-        }
-    )*};
-}
-
-types! {
-    PoseWithCovarianceStamped "geometry_msgs/PoseWithCovarianceStamped",
-    Odometry "nav_msgs/Odometry",
-    PoseArray "geometry_msgs/PoseArray",
-    TfMessage "tf2_msgs/TFMessage",
-    PointCloud2 "sensor_msgs/PointCloud2",
-    Image "sensor_msgs/Image",
-    CompressedImage "sensor_msgs/CompressedImage",
-    CameraInfo "sensor_msgs/CameraInfo",
-    DiagnosticArray "diagnostic_msgs/DiagnosticArray",
-    FrameRecord "semidense_msgs/Frame",
-    PoseRecord "semidense_msgs/Pose",
-    KeyframeRecord "semidense_msgs/Keyframe",
-    GraphRecord "semidense_msgs/Graph",
-}
-
 /// Whether messages are resent until they arrive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reliability {
