@@ -87,17 +87,14 @@ impl Trajectory {
         let (walk, turn) = (self.walk_rate * time_s, self.turn_rate * time_s);
         let RoutePose { place, angles: [heading, elevation] } = match self.route {
             Some((route, seed)) => route.at(walk, seed),
-            None => {
-                let offset = |k: usize| sum(&self.walk[k], walk);
-                RoutePose {
-                    place: Vector3::from(self.stage.centre)
-                        + Vector3::new(offset(0), offset(1), offset(2)),
-                    angles: [
-                        self.stage.heading_rad + sum(&self.turn[0], turn),
-                        self.stage.elevation_rad + sum(&self.turn[1], turn),
-                    ],
-                }
-            }
+            None => RoutePose {
+                place: Vector3::from(self.stage.centre)
+                    + Vector3::from_fn(|k, _| sum(&self.walk[k], walk)),
+                angles: [
+                    self.stage.heading_rad + sum(&self.turn[0], turn),
+                    self.stage.elevation_rad + sum(&self.turn[1], turn),
+                ],
+            },
         };
         let tremor = |k: usize| sum(&self.tremor[k], time_s);
         let roll = sum(&self.turn[2], turn) + tremor(5);
