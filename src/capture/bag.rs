@@ -27,7 +27,7 @@ use crate::capture::rectifier::Rectifier;
 use crate::capture::rig::Rig;
 use crate::capture::source::{FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
-use crate::capture::v4l::stamps::MAX_REFUSED_IN_A_ROW;
+use crate::capture::v4l::stamps::StampOrder;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// A topic's images as a frame source.
@@ -45,10 +45,7 @@ pub struct Bag {
     first_sequence: Option<u64>,
     /// Sequence of the next frame unless its record has one.
     next: u64,
-    /// Stamp of the previous frame.
-    last_nanos: Option<i64>,
-    /// Images refused for their stamps since then.
-    refused_in_a_row: u32,
+    order: StampOrder,
     notice: Option<Notice>,
 }
 
@@ -77,8 +74,7 @@ pub fn open(path: &Path, topic: Option<&str>, rig: Option<&Path>) -> Result<Bag,
         record: None,
         first_sequence: None,
         next: 0,
-        last_nanos: None,
-        refused_in_a_row: 0,
+        order: StampOrder::default(),
         notice,
     })
 }
@@ -137,21 +133,12 @@ impl Bag {
                 ..FrameStamp::default()
             },
         };
-        self.check_order(frame.capture_nanos)?;
-        self.next = frame.sequence.saturating_add(1);
-        Ok(frame)
-    }
-
-    /// Refuses a stamp that is not later than the previous one, until so many in a row show that the clock has stepped.
-    fn check_order(&mut self, nanos: i64) -> Result<(), BagImageError> {
-        let is_old = self.last_nanos.is_some_and(|last| nanos <= last);
-        if is_old && self.refused_in_a_row < MAX_REFUSED_IN_A_ROW {
-            self.refused_in_a_row += 1;
+        let nanos = frame.capture_nanos;
+        if !self.order.accepts(nanos) {
             return Err(BagImageError::Disordered { nanos });
         }
-        self.refused_in_a_row = 0;
-        self.last_nanos = Some(nanos);
-        Ok(())
+        self.next = frame.sequence.saturating_add(1);
+        Ok(frame)
     }
 
     fn lost(&self, problem: BagImageError) -> SourceError {

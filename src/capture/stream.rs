@@ -22,7 +22,7 @@ use crate::capture::rig::Rig;
 use crate::capture::source::{Arrival, FrameClocks, FrameLosses, FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
 use crate::capture::v4l::READ_MILLIS;
-use crate::capture::v4l::stamps::{FrameNumbers, MAX_REFUSED_IN_A_ROW};
+use crate::capture::v4l::stamps::{FrameNumbers, StampOrder};
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// The program that reads ROS 2 topics.
@@ -54,8 +54,7 @@ pub struct StreamSource {
     stall_s: f64,
     /// When the last frame arrived, or its sender connected.
     newest_nanos: i64,
-    last_nanos: Option<i64>,
-    refused_in_a_row: u32,
+    order: StampOrder,
     has_streamed: bool,
 }
 
@@ -119,8 +118,7 @@ impl StreamSource {
             fault: None,
             stall_s,
             newest_nanos: i64::MIN,
-            last_nanos: None,
-            refused_in_a_row: 0,
+            order: StampOrder::default(),
             has_streamed: false,
         })
     }
@@ -218,14 +216,10 @@ impl StreamSource {
         let (sequence, missing) = self.numbers.number(header.sequence as u32);
         self.losses.missing += missing;
         let (capture_nanos, clocks) = stamp_of(&header, arrival_nanos, nanos_of(ClockId::Realtime));
-        let before = self.held.map(|(_, stamp)| stamp.capture_nanos).or(self.last_nanos);
-        let is_old = before.is_some_and(|before| capture_nanos <= before);
-        self.refused_in_a_row = if is_old { self.refused_in_a_row + 1 } else { 0 };
-        if is_old && self.refused_in_a_row <= MAX_REFUSED_IN_A_ROW {
+        if !self.order.accepts(capture_nanos) {
             self.losses.broken += 1;
             return;
         }
-        self.refused_in_a_row = 0;
         let stamp = FrameStamp {
             sequence,
             capture_nanos,
@@ -237,7 +231,6 @@ impl StreamSource {
         if self.held.replace((header, stamp)).is_some() {
             self.losses.late += 1;
         }
-        self.last_nanos = Some(capture_nanos);
     }
 }
 

@@ -9,6 +9,7 @@ use crate::capture::test_bag::{
     TestBag, camera_info, compressed_image, frame_record, image, record,
 };
 use crate::capture::test_images::flat_block_jpeg;
+use crate::capture::v4l::stamps::MAX_REFUSED_IN_A_ROW;
 use crate::slam::geometry::camera_model::Distortion;
 
 const WIDTH: u32 = 32;

@@ -71,6 +71,26 @@ impl FrameNumbers {
     }
 }
 
+/// Refuses stamps that are not later than the last one accepted, until [`MAX_REFUSED_IN_A_ROW`] were refused.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct StampOrder {
+    last_nanos: Option<i64>,
+    refused_in_a_row: u32,
+}
+
+impl StampOrder {
+    /// Whether the frame with this stamp is accepted.
+    pub fn accepts(&mut self, nanos: i64) -> bool {
+        let is_old = self.last_nanos.is_some_and(|last| nanos <= last);
+        if is_old && self.refused_in_a_row < MAX_REFUSED_IN_A_ROW {
+            self.refused_in_a_row += 1;
+            return false;
+        }
+        (self.last_nanos, self.refused_in_a_row) = (Some(nanos), 0);
+        true
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
