@@ -136,10 +136,11 @@ impl Knob {
         if self.is_automatic(device) {
             return Ok(());
         }
-        let tried = on.iter().fold(Err(Errno::INVAL), |answer, &value| {
-            answer.or_else(|_| device.set_value(id, value))
-        });
-        tried.map_err(|error| self.refused(error))
+        let mut answer = Err(Errno::INVAL);
+        for &value in on {
+            answer = answer.or_else(|_| device.set_value(id, value));
+        }
+        answer.map_err(|error| self.refused(error))
     }
 
     fn manual(&self, device: &mut dyn VideoDevice) -> Result<(), String> {
