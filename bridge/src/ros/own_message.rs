@@ -13,7 +13,7 @@ use crate::session::Graph;
 messages! {
     OWN_MESSAGES:
 
-    /// `semidense_msgs/Frame`: properties of an image that `sensor_msgs` lacks. Replaying a recording uses these stamps.
+    /// `semidense_msgs/Frame`: properties of an image that `sensor_msgs` lacks; a replay of a recording uses its stamps.
     "semidense_msgs/Frame" FrameRecord {
         /// Stamp and frame of the image.
         header: Header,

@@ -131,8 +131,8 @@ impl MapWriter {
         Ok(())
     }
 
-    /// Writes the manifest with a [`head_of`] a map, which makes this the map. Keyframes of another camera, those that contradicted themselves
-    /// and those whose depth was never written are left out.
+    /// Writes the manifest with a [`head_of`] a map, which makes this the map. Keyframes of another camera, those that
+    /// contradicted themselves and those whose depth was never written are left out.
     pub fn save(&mut self, camera: &Intrinsics, head: Map) -> Result<(), MapFolderError> {
         let is_kept = |keyframe: &Keyframe| {
             keyframe.intrinsics == *camera && keyframe.map_state == MapState::Established
