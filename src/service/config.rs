@@ -427,7 +427,7 @@ fn apply(table: &mut Table, setting: &str) -> Result<(), String> {
     if key.is_empty() || key.ends_with('.') {
         return Err(form.to_owned());
     }
-    if key == layout::EXPERT {
+    if key.trim() == layout::EXPERT {
         return Err("it has keys below it, as in expert.mapping.min_gradient=5.0".to_owned());
     }
     layout::put(table, key, value)

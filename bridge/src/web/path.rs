@@ -7,6 +7,7 @@ use crate::session::Pose;
 
 /// Upper limit for the poses kept: half an hour at 30 Hz. Beyond it, every second one is removed.
 const MAX_POSES: usize = 1 << 16;
+
 /// A pose of the path, as it is in a message.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, IntoBytes, Immutable)]
