@@ -365,6 +365,20 @@ mod tests {
     use crate::wire::topic::TRACKER_HEALTH;
 
     #[test]
+    fn codes_of_policies_are_those_that_other_programs_know() {
+        let codes = [
+            (Some(Policy::Other), 0, "other"),
+            (Some(Policy::Fifo), 1, "fifo"),
+            (Some(Policy::Deadline), 2, "deadline"),
+            (Some(Policy::Inherit), 3, "unknown"),
+            (None, 3, "unknown"),
+        ];
+        for (policy, code, name) in codes {
+            assert_eq!((scheduling_code(policy), scheduling_name(code)), (code, name));
+        }
+    }
+
+    #[test]
     fn buckets_are_half_octaves() {
         assert_eq!(bucket(0), 0);
         assert_eq!(bucket(1_000), 0);

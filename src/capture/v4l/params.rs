@@ -182,6 +182,18 @@ mod tests {
     }
 
     #[test]
+    fn a_named_format_is_that_of_its_name() {
+        use PixelFormat::*;
+        let of = |name: &str| {
+            let text = format!("format = {name:?}");
+            toml::from_str::<CameraParams>(&text).unwrap().format.format()
+        };
+        let names = ["grey", "y10", "y12", "y16", "yuyv", "uyvy", "nv12", "mjpeg"];
+        assert_eq!(names.map(of), [Grey, Y10, Y12, Y16, Yuyv, Uyvy, Nv12, Mjpeg].map(Some));
+        assert_eq!(of("auto"), None);
+    }
+
+    #[test]
     fn values_out_of_range_are_named() {
         assert!(CameraParams::default().validate().is_ok());
         let wrong = |change: fn(&mut CameraParams)| {

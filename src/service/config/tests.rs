@@ -67,6 +67,19 @@ fn presets_load_and_change_every_key_they_name() {
 }
 
 #[test]
+fn the_text_of_a_configuration_has_a_users_keys_outside_expert() {
+    let text = Config::default().to_text();
+    let table: toml::Table = text.parse().unwrap();
+    let has = |table: &toml::Table, of: &str, key: &str| {
+        table.get(of).is_some_and(|inner| inner.get(key).is_some())
+    };
+    let expert = table["expert"].as_table().unwrap();
+    assert!(has(&table, "tracker", "deadline_ms") && !has(expert, "tracker", "deadline_ms"));
+    assert!(has(expert, "mapping", "min_gradient") && !has(&table, "mapping", "min_gradient"));
+    assert_eq!(Config::from_text(&text, "x.toml").unwrap(), Config::default());
+}
+
+#[test]
 fn a_key_is_the_same_with_and_without_expert() {
     let read = |text: &str| Config::from_text(text, "x.toml");
     let expected = set(&["mapping.matching.line_noise_px=0.5"]).unwrap();
@@ -112,7 +125,10 @@ fn errors_below_expert_name_line_and_listed_key() {
     );
     let told = set(&["expert.mapping.min_gradint=6.0"]).unwrap_err();
     assert!(told.contains("unknown key `mapping.min_gradint`; keys of `mapping` are "), "{told}");
-    assert!(set(&["expert=2"]).unwrap_err().starts_with("--set expert=2: it has keys below it"));
+    for setting in ["expert=2", "expert. expert=2"] {
+        let expected = format!("--set {setting}: it has keys below it");
+        assert!(set(&[setting]).unwrap_err().starts_with(&expected), "{setting}");
+    }
     let told = set(&["tracking.min_contrast=-1.0"]).unwrap_err();
     assert!(told.contains("expert.tracking.min_contrast = -1: must be"), "{told}");
 }

@@ -31,3 +31,17 @@ impl AnyBytes {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_path_is_the_same_after_json() {
+        for path in [&b"tum:a \"b\"\n"[..], b"\xff\x00/x", b""] {
+            let path = OsString::from_vec(path.to_vec());
+            let json = serde_json::to_string(&AnyBytes::from(&path)).unwrap();
+            assert_eq!(serde_json::from_str::<AnyBytes>(&json).unwrap().to_os_string(), path);
+        }
+    }
+}

@@ -8,7 +8,7 @@ use super::*;
 use crate::service::config::MapConfig;
 use crate::service::map_folder::reading::{BEFORE, KEYFRAMES, MANIFEST, load};
 use crate::service::map_folder::session::first_own_id;
-use crate::service::map_folder::writer::MapWriter;
+use crate::service::map_folder::writer::{MapWriter, head_of};
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
@@ -42,8 +42,7 @@ fn keyframe(keyframe_id: u64, revision: u64) -> Keyframe {
 }
 
 fn head(keyframes: &[Keyframe]) -> Map {
-    let keyframes = keyframes.iter().map(Keyframe::without_depth).collect();
-    Map { keyframes, revision: 6, free_epoch: 4, ..Map::default() }
+    head_of(&Map { keyframes: keyframes.to_vec(), revision: 6, ..Map::default() }, 4)
 }
 
 /// Saves keyframes, all with their depth.

@@ -173,6 +173,15 @@ pub(super) mod tests {
     }
 
     #[test]
+    fn a_source_without_frames_and_poses_at_other_times_are_named() {
+        let none = record(0, 0, TrackingState::Initializing);
+        assert_eq!(why_untracked(&none).unwrap(), "the source delivered no frame");
+        let counters = RunCounters { frames_in: 60, ..RunCounters::default() };
+        let given = RunRecord { counters, depth_scale: DepthScale::Given, ..none };
+        assert!(why_untracked(&given).unwrap().starts_with("no frame has a true pose near its"));
+    }
+
+    #[test]
     fn lost_frames_show_that_a_map_began() {
         let lost = TrackingState::Lost(LostReason::TooFewInliers);
         let text = |record: &RunRecord| why_untracked(record).unwrap();
