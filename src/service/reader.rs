@@ -214,7 +214,9 @@ impl Session {
             std::iter::once(Event::Joined).chain(first).for_each(&mut take);
         }
         if is_over || self.heard.elapsed() > LONGEST_SILENCE {
-            (self.ports, self.tried) = (None, Some(Instant::now()));
+            // Where the next run has begun it is joined at once.
+            self.tried = (!ports.is_next_heard()).then(Instant::now);
+            self.ports = None;
             if std::mem::take(&mut self.is_joined) {
                 take(Event::Left);
             }
@@ -256,6 +258,8 @@ impl Session {
 struct Ports {
     /// Whether the last report of each process is that it has finished, in the order of `health`.
     has_finished: [bool; HEALTH_TOPICS.len()],
+    /// The same of any report that was taken last: those of the next run may follow.
+    has_finished_before: [bool; HEALTH_TOPICS.len()],
     poses: Subscriber<PoseMessage, ()>,
     health: Vec<(&'static str, Subscriber<HealthMessage, ()>)>,
     frames: Option<Subscriber<u8, FrameHeader>>,
@@ -274,6 +278,7 @@ impl Ports {
             .collect();
         Ok(Self {
             has_finished: Default::default(),
+            has_finished_before: Default::default(),
             poses: hub.subscriber(&POSE)?,
             health: health?,
             frames: wants.frames.then(|| hub.subscriber(&FRAME)).transpose()?,
@@ -293,8 +298,13 @@ impl Ports {
 
     /// Whether tracker and mapper have finished: their last messages have arrived.
     fn is_over(&self) -> bool {
-        let [_capture, tracker, mapper] = self.has_finished;
-        tracker && mapper
+        let ends = self.has_finished.iter().zip(self.has_finished_before);
+        ends.skip(1).all(|(now, before)| *now || before)
+    }
+
+    /// Whether the run is over and a process of the next one has reported.
+    fn is_next_heard(&self) -> bool {
+        self.is_over() && self.has_finished[1..].contains(&false)
     }
 
     /// Keyframes before poses: a pose names its keyframe.
@@ -303,10 +313,13 @@ impl Ports {
         refused: &mut u64,
         take: &mut dyn FnMut(Event),
     ) -> Result<(), ReceiveError> {
-        for ((owner, port), has_finished) in self.health.iter().zip(&mut self.has_finished) {
+        self.has_finished_before = Default::default();
+        for (place, (owner, port)) in self.health.iter().enumerate() {
             while let Some(message) = port.receive()? {
                 for health in message.payload() {
-                    *has_finished = health.state == ProcessState::Finished.code();
+                    let has_finished = health.state == ProcessState::Finished.code();
+                    self.has_finished[place] = has_finished;
+                    self.has_finished_before[place] |= has_finished;
                     take(Event::Health(owner, Box::new(*health)));
                 }
             }

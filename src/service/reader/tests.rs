@@ -72,6 +72,36 @@ fn a_session_joins_with_the_first_message_and_leaves_with_the_last() {
 }
 
 #[test]
+fn the_end_of_a_run_that_is_read_with_the_next_run_is_not_taken_for_its_beginning() {
+    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+    let [mut early, mut joined] =
+        ["early", "joined"].map(|name| Session::new(place.clone(), name, Wants::default()));
+    let processes = Processes::start(&place);
+    // However busy the machine is.
+    let take = |session: &mut Session, count: usize| {
+        let (begun, mut said) = (Instant::now(), String::new());
+        while said.len() < count && begun.elapsed() < LONGEST_SILENCE {
+            said += &read(session, Some(&processes), Duration::from_millis(20));
+        }
+        said
+    };
+    joined.try_to_join().unwrap();
+    processes.report(ProcessState::Running);
+    assert_eq!(take(&mut joined, 4), "+...");
+    // It has opened the topics and not read them yet when the run ends and the next one begins.
+    early.try_to_join().unwrap();
+    assert!(early.ports.is_some());
+    processes.serve_late_joiners();
+    processes.report(ProcessState::Finished);
+    processes.report(ProcessState::Running);
+    assert_eq!(take(&mut early, 4), "+...");
+    assert_eq!(take(&mut joined, 11), "......-+...");
+    drop((early, joined, processes));
+    place.tidy();
+}
+
+#[test]
 fn two_readers_do_not_keep_each_other_joined() {
     let folder = tempfile::tempdir().unwrap();
     let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
