@@ -24,8 +24,6 @@ const MAGIC: [u8; 16] = *b"semidense log 8\n";
 const PREFIX_BYTES: usize = 8;
 /// Largest record, bytes: the configuration is a tenth of it.
 const MAX_RECORD_BYTES: usize = 1 << 20;
-/// Largest log that is read, bytes: three weeks of poses at 30 Hz would be larger.
-pub(super) const MAX_LOG_BYTES: u64 = 32 << 30;
 
 /// How a run was started: everything needed to open its source again.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -188,8 +186,7 @@ pub enum LogEnd {
 }
 
 /// Reads a log to its end, or to the first incomplete record.
-pub fn read_log(log: impl Read, take: &mut dyn FnMut(Record)) -> LogEnd {
-    let mut log = log.take(MAX_LOG_BYTES);
+pub fn read_log(mut log: impl Read, take: &mut dyn FnMut(Record)) -> LogEnd {
     let mut magic = [0; MAGIC.len()];
     if log.read_exact(&mut magic).is_err() || magic != MAGIC {
         return LogEnd::Unknown;

@@ -12,7 +12,6 @@ use crossbeam::channel::{Receiver, Sender};
 use rustix::fs::FlockOperation;
 
 use crate::service::journal::folder::{LOG, keyframe_file};
-use crate::service::journal::log::MAX_LOG_BYTES;
 use crate::service::map_file::write_map_into;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
@@ -181,9 +180,7 @@ impl Writer {
             Ok(()) => {
                 self.good_bytes += self.waiting.len() as u64;
                 self.waiting = Vec::new();
-                if self.good_bytes <= MAX_LOG_BYTES {
-                    self.on_disk.store(self.poses, Ordering::Release);
-                }
+                self.on_disk.store(self.poses, Ordering::Release);
                 Ok(())
             }
             Err(error) => {
@@ -315,14 +312,18 @@ mod tests {
         writer.log = log;
         writer.write(Entry::Log(step(2), 6));
         assert_eq!(counted(), 6);
+        // A run of months: its log is written and read to the end.
+        writer.good_bytes = 1 << 40;
+        writer.write(Entry::Log(step(3), 7));
+        assert_eq!(counted(), 7);
         // Beyond the limit records are left out, and poses after them are not counted.
         writer.waiting = vec![0; MAX_WAITING_BYTES];
         writer.log = File::options().write(true).open("/dev/full").unwrap();
-        writer.write(Entry::Log(step(3), 9));
+        writer.write(Entry::Log(step(4), 9));
         (writer.log, writer.waiting) =
             (File::create(folder.path().join("other")).unwrap(), Vec::new());
-        writer.write(Entry::Log(step(4), 12));
-        assert_eq!(counted(), 6);
+        writer.write(Entry::Log(step(5), 12));
+        assert_eq!(counted(), 7);
     }
 
     #[test]
