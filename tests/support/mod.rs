@@ -5,12 +5,15 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
+use std::sync::{Arc, Once};
 use std::time::{Duration, Instant};
 
 use semidense::service::journal::recovered::Recovered;
+use semidense::service::shutdown::is_ignored;
 use semidense::wire::folders::SHARED_MEMORY;
 use semidense::wire::place::Place;
 use semidense::wire::port::{Access, Hub};
+use signal_hook::consts::SIGHUP;
 
 /// Far above any expected duration: it ends a test that hangs, it measures nothing.
 pub const WATCH_DOG: Duration = Duration::from_secs(240);
@@ -35,6 +38,7 @@ pub struct Ended {
 
 impl Rig {
     pub fn new() -> Self {
+        hear_hang_ups();
         Self { folder: tempfile::tempdir().unwrap() }
     }
 
@@ -92,6 +96,17 @@ impl Rig {
         left.extend(names(Path::new(SHARED_MEMORY)).into_iter().filter(|n| n.starts_with(&prefix)));
         left
     }
+}
+
+/// Lets children hear SIGHUP even if the tests were started with `nohup`: a signal that is handled here has its default
+/// effect there.
+fn hear_hang_ups() {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        if is_ignored(SIGHUP) {
+            signal_hook::flag::register(SIGHUP, Arc::default()).unwrap();
+        }
+    });
 }
 
 /// Calls `ask` repeatedly until there is an answer.
