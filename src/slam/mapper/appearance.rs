@@ -46,6 +46,16 @@ impl Appearance {
         Self { greys, details }
     }
 
+    /// This image from another viewpoint: `seen_at` tells which of its pixels shows what each pixel of that shows. Where
+    /// none does, the mean grey lowers the similarity to anything.
+    pub(in crate::slam) fn resampled(&self, seen_at: impl Fn(usize) -> Option<usize>) -> Self {
+        let grey = |pixel| seen_at(pixel).and_then(|at| self.greys.get(at).copied());
+        let greys: Vec<Option<f32>> = (0..COLUMNS * ROWS).map(grey).collect();
+        let count = greys.iter().flatten().count().max(1);
+        let mean = greys.iter().flatten().sum::<f32>() / count as f32;
+        Self::with(greys.into_iter().map(|grey| grey.unwrap_or(mean)).collect())
+    }
+
     /// Fine detail, row-major: light and large surfaces are removed, so that it tells apart views that share little.
     pub(in crate::slam) fn details(&self) -> &[f32] {
         &self.details

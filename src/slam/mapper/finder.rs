@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use nalgebra::UnitQuaternion;
+
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
 use crate::slam::alignment::normal_equations::NormalEquations;
 use crate::slam::alignment::reference::{
@@ -15,7 +17,7 @@ use crate::slam::kernel::SimdMode;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::appearance::Appearance;
 use crate::slam::mapper::recovery::RecoveryParams;
-use crate::slam::mapper::turned_views::TurnedViews;
+use crate::slam::mapper::turned_views::{TurnedViews, turned_back};
 use crate::slam::places::{Describer, PlaceCandidate, PlaceIndex};
 use crate::slam::pose::Brightness;
 use crate::slam::tracker::motion::rotations_around;
@@ -301,10 +303,17 @@ impl Finder {
 
     /// Whether a frame shows some of what a keyframe shows. At wrong places that fitted otherwise, and that a second
     /// keyframe confirmed, it shared five and eight features, and the small images correlated by 0.31 and 0.33; at 60
-    /// right ones ten features and more, or small images correlated by 0.5 and more.
-    pub(super) fn resembles(&mut self, keyframe: &Keyframe, pixels: &[u8]) -> bool {
+    /// right ones ten features and more, or small images correlated by 0.5 and more. `rotation` is the one found,
+    /// `keyframe_from_camera`.
+    pub(super) fn resembles(
+        &mut self,
+        keyframe: &Keyframe,
+        rotation: &UnitQuaternion<f64>,
+        pixels: &[u8],
+    ) -> bool {
         let Intrinsics { width, height, .. } = self.camera;
         let is_alike = |seen: Appearance| {
+            let seen = turned_back(&seen, &self.camera, rotation);
             self.appearance(keyframe).is_some_and(|of| of.similarity(&seen) >= FOUND_SIMILARITY)
         };
         if Appearance::of(pixels, width, height).is_some_and(is_alike) {

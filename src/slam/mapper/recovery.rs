@@ -131,7 +131,11 @@ impl Mapper {
         let (index, keyframe_from_camera) = found?;
         let is_possible = !self.contradicts_hold(pose, index, &keyframe_from_camera);
         if is_possible
-            && self.finder.resembles(&self.map.keyframes[index], pixels)
+            && self.finder.resembles(
+                &self.map.keyframes[index],
+                &keyframe_from_camera.rotation,
+                pixels,
+            )
             && self.is_confirmed(index, &keyframe_from_camera, pixels, &Confirmation::after_loss())
             && self.points_agree(index, &keyframe_from_camera, pixels)
         {

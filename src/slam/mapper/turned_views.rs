@@ -4,7 +4,7 @@
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::mapper::appearance::{COLUMNS, ROWS};
+use crate::slam::mapper::appearance::{Appearance, COLUMNS, ROWS};
 
 /// Pixels of a small image.
 const COUNT: usize = COLUMNS * ROWS;
@@ -72,7 +72,7 @@ impl TurnedViews {
     }
 
     /// The view in which each keyframe is most similar to the frame. Both are given by the details of their
-    /// [`Appearance`](crate::slam::mapper::appearance::Appearance).
+    /// [`Appearance`].
     pub(in crate::slam) fn compare(
         &self,
         frame: &[f32],
@@ -100,6 +100,17 @@ impl TurnedViews {
         }
         best
     }
+}
+
+/// What `frame` shows, turned to the view of a keyframe; `rotation` is `keyframe_from_camera`.
+pub(in crate::slam) fn turned_back(
+    frame: &Appearance,
+    camera: &Intrinsics,
+    rotation: &UnitQuaternion<f64>,
+) -> Appearance {
+    let camera_from_keyframe = rotation.inverse().to_rotation_matrix();
+    // `OUTSIDE` is no pixel of the frame.
+    frame.resampled(|pixel| Some(usize::from(seen_at(camera, &camera_from_keyframe, pixel))))
 }
 
 /// The camera's pixel that sees a distant point at a pixel of the keyframe.
@@ -154,7 +165,6 @@ fn score(common: f32, [ours, theirs]: [f32; 2], count: f32) -> Option<f32> {
 mod tests {
     use super::*;
     use crate::slam::geometry::se3::SE3;
-    use crate::slam::mapper::appearance::Appearance;
     use crate::slam::test_scene::{CAMERA, Scene};
 
     fn seen(pose: &SE3, seed: u64) -> Appearance {

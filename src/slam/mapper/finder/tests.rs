@@ -209,3 +209,25 @@ fn keyframes_of_another_camera_are_not_searched() {
     known.intrinsics.fx *= 1.01;
     assert_eq!(find(&known), (false, false));
 }
+
+#[test]
+fn a_rolled_or_turned_view_resembles_its_keyframe_by_its_small_image_alone() {
+    let scene = Scene::new(3);
+    let mut keyframes = [keyframe(&scene, 0, at([0.0; 6]))];
+    let mut finder = Finder::new(&CAMERA);
+    finder.index_new(&mut keyframes, MAX_INDEXED);
+    // Without its features.
+    finder.places.remove(0);
+    let mut resembles = |found: SE3, pan: f64| {
+        let view = at([0.0, 0.0, 0.0, 0.0, pan, 0.0]) * found;
+        let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
+        finder.resembles(&keyframes[0], &found.rotation, &pixels)
+    };
+    let roll = |degrees: f64| [0.02, 0.0, 0.05, 0.0, 0.0, degrees.to_radians()];
+    for twist in [roll(0.0), roll(30.0), roll(-90.0), roll(180.0), [0.0, 0.0, 0.0, 0.1, 0.3, 0.2]] {
+        assert!(resembles(at(twist), 0.0), "{twist:?}");
+        for pan in [1.2, -1.5, 2.8] {
+            assert!(!resembles(at(twist), pan), "{twist:?} elsewhere");
+        }
+    }
+}
