@@ -33,6 +33,7 @@ pub struct FrameOrder {
     last: Option<(u64, i64)>,
     period_nanos: Option<i64>,
     repeated: u32,
+    has_ended: bool,
 }
 
 impl FrameOrder {
@@ -48,8 +49,14 @@ impl FrameOrder {
             .is_some_and(|last| now_nanos().saturating_sub(last) as f64 > allowed_nanos)
     }
 
+    /// Notes that the source has ended: a frame that seems repeated is then the first of the next source.
+    pub fn end(&mut self) {
+        self.has_ended = true;
+    }
+
     /// Classifies the next frame. Accepts arbitrary input.
     pub fn arrive(&mut self, header: &FrameHeader) -> FrameOrderOutcome {
+        let is_next_source = std::mem::take(&mut self.has_ended);
         let (sequence, stamp) = (header.sequence, header.capture_nanos);
         let Some((last_sequence, last_stamp)) = self.last else {
             self.last = Some((sequence, stamp));
@@ -57,7 +64,7 @@ impl FrameOrder {
         };
         if sequence <= last_sequence {
             self.repeated += 1;
-            if self.repeated < RENUMBERED_FRAMES {
+            if self.repeated < RENUMBERED_FRAMES && !is_next_source {
                 return FrameOrderOutcome::Repeated;
             }
             (self.last, self.repeated) = (Some((sequence, stamp)), 0);
@@ -124,6 +131,19 @@ mod tests {
         assert!(arrivals.by_ref().take(9).all(|arrival| arrival == FrameOrderOutcome::Repeated));
         assert_eq!(arrivals.next(), Some(FrameOrderOutcome::Renumbered));
         assert_eq!(order.arrive(&frame(10, 1330)), FrameOrderOutcome::Next { missing: 0 });
+    }
+
+    #[test]
+    fn the_next_source_loses_no_frame() {
+        let mut order = FrameOrder::default();
+        order.arrive(&frame(0, 0));
+        order.arrive(&frame(1, 33));
+        order.end();
+        assert_eq!(order.arrive(&frame(0, 10)), FrameOrderOutcome::Renumbered);
+        assert_eq!(order.arrive(&frame(0, 10)), FrameOrderOutcome::Repeated);
+        order.end();
+        assert_eq!(order.arrive(&frame(1, 43)), FrameOrderOutcome::Next { missing: 0 });
+        assert_eq!(order.arrive(&frame(1, 43)), FrameOrderOutcome::Repeated);
     }
 
     #[test]

@@ -251,6 +251,9 @@ impl<'a> Shell<'a> {
     fn check_for_silence(&mut self) -> Result<(), ReceiveError> {
         // Its last message is received only by those that have listened before it ends.
         let (state, cause) = self.capture.state_in_silence()?;
+        if self.capture.state() == Some(ProcessState::Finished) {
+            self.order.end();
+        }
         let periods = self.config.tracker.stale_periods;
         if self.mode == Mode::Live && self.order.is_silent(self.last_arrival_nanos, periods) {
             self.health.enter(state, cause);
