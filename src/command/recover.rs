@@ -212,11 +212,15 @@ fn record_of(
     source: &dyn FrameSource,
 ) -> RunRecord {
     let start = &recovered.start;
+    let loaded_map = recovered.loaded_map.clone();
     let depth_scale = if start.poses_given { DepthScale::Given } else { DepthScale::MedianRatio };
     let known = RunRecord {
         ended: EndOfRun::Recovered(recovered.ended),
         map: recovered.map(folder, config.mapping.max_map_bytes() as u64),
-        first_keyframe_id: start.first_keyframe_id,
+        first_keyframe_id: loaded_map
+            .as_ref()
+            .map_or(start.first_keyframe_id, |map| map.first_keyframe_id),
+        loaded_map,
         ground_truth: source.ground_truth().to_vec(),
         counters: recovered.counters,
         depth_scale,

@@ -8,7 +8,7 @@ use crate::service::journal::log::{Record, Step};
 use crate::service::journal::recovered::complete;
 use crate::service::journal::{Journal, JournalOptions};
 use crate::service::recording::Recording;
-use crate::service::results::record::{RunCounters, RunRecord};
+use crate::service::results::record::{LoadedMap, RunCounters, RunRecord};
 use crate::slam::map::Map;
 use crate::wire::message::{AdjustmentMessage, PoseMessage, StepMessage};
 use crate::wire::place::Place;
@@ -25,6 +25,8 @@ pub struct Recorder {
     pub recording: Recording,
     /// The last step of the mapper.
     pub last_step: Option<StepMessage>,
+    /// The map in the journal that the mapper has switched to.
+    loaded_map: Option<LoadedMap>,
     journal: Option<Journal>,
     /// Needed by the journal alone; `None` without one, and after it has failed.
     keyframes: Option<KeyframeFeed>,
@@ -51,6 +53,7 @@ impl Recorder {
             adjustments: hub.subscriber(&ADJUSTMENT)?,
             recording: Recording::default(),
             last_step: None,
+            loaded_map: None,
             journal,
             keyframes,
         })
@@ -110,6 +113,14 @@ impl Recorder {
     fn keep(&mut self, record: impl FnOnce() -> Record) {
         if let Some(journal) = &mut self.journal {
             journal.append(&record());
+        }
+    }
+
+    /// Writes the map that the mapper has switched to into the journal, unless it is there.
+    pub fn note_loaded_map(&mut self, loaded: Option<LoadedMap>) {
+        if let Some(map) = loaded.filter(|map| self.loaded_map.as_ref() != Some(map)) {
+            self.keep(|| Record::LoadedMap(Box::new(map.clone())));
+            self.loaded_map = Some(map);
         }
     }
 

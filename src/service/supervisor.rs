@@ -271,6 +271,7 @@ impl<'a> Supervisor<'a> {
                 process.listen()?;
             }
             if self.recorder.wants_counters() {
+                self.recorder.note_loaded_map(loaded_map(&self.place));
                 self.recorder.count(self.counters());
             }
             observe(&self.progress());

@@ -5,9 +5,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Child;
 
-use crate::support::{Ended, Rig, end, finish, signal, small_camera, until};
+use crate::support::{Ended, Rig, end, finish, journal_of, signal, small_camera, until};
 use rustix::process::{Pid, Signal, kill_process};
 use semidense::service::health::cause;
+use semidense::service::journal::recovered::Recovered;
 use semidense::service::map_folder::reading::{load, read_manifest};
 use semidense::service::peers::Peer;
 use semidense::slam::map::Map;
@@ -134,6 +135,26 @@ fn a_running_mapper_continues_in_another_map_and_so_does_its_successor() {
         |map: &Map| map.keyframes.iter().filter(|of| before.contains(&of.keyframe_id)).count();
     assert_eq!(poses(&grown), before.len());
     assert!(!rig.root().join("semidense.map").exists(), "an orderly end leaves nothing behind");
+}
+
+#[test]
+fn a_killed_run_is_recovered_with_the_map_that_it_had_switched_to() {
+    let rig = Rig::new();
+    let other = make_map(&rig, "other", None);
+    let mut running = Running::start(&rig);
+    let loaded = load_map(&rig, &[], &other);
+    assert!(loaded.status.success(), "{}", loaded.stderr);
+    running.wait_for("localised");
+    let journal = journal_of(&rig.output(), 1);
+    until("the map in the journal", || Recovered::read(&journal).ok()?.loaded_map);
+    signal(&running.child, Signal::KILL);
+    end(running.child);
+    let mut recover = rig.command(&["recover"]);
+    recover.arg(rig.output());
+    let ended = finish(recover);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    assert!(ended.stdout.contains(other.to_str().unwrap()), "{}", ended.stdout);
+    assert!(!ended.stdout.contains("separate parts"), "{}", ended.stdout);
 }
 
 #[test]

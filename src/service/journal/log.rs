@@ -13,13 +13,13 @@ use zerocopy::{FromBytes, Immutable, IntoBytes};
 use crate::service::bytes::take;
 use crate::service::journal::any_bytes::AnyBytes;
 use crate::service::map_file::{keyframe_bytes, parse_keyframe};
-use crate::service::results::record::{RunCounters, RunMode};
+use crate::service::results::record::{LoadedMap, RunCounters, RunMode};
 use crate::slam::keyframe::{Keyframe, KeyframePose};
 use crate::wire::conversion::{similarity_from_message, similarity_message};
 use crate::wire::message::{AdjustmentMessage, PoseMessage};
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense log 8\n";
+const MAGIC: [u8; 16] = *b"semidense log 9\n";
 /// Bytes before kind and payload.
 const PREFIX_BYTES: usize = 8;
 /// Largest record, bytes: the configuration is a tenth of it.
@@ -86,6 +86,8 @@ pub enum Record {
     Keyframe(Box<Keyframe>),
     /// The new pose of a keyframe; its uncertainty is unchanged.
     KeyframePose(u32, KeyframePose),
+    /// The map that the mapper has switched to.
+    LoadedMap(Box<LoadedMap>),
 }
 
 impl Record {
@@ -96,6 +98,7 @@ impl Record {
     const KEYFRAME: u8 = 5;
     const KEYFRAME_POSE: u8 = 6;
     const ADJUSTMENT: u8 = 7;
+    const LOADED_MAP: u8 = 8;
 
     /// Appends the record's bytes to `log`.
     pub fn write(&self, log: &mut Vec<u8>) {
@@ -131,6 +134,10 @@ impl Record {
                 log.push(Self::COUNTERS);
                 log.extend(serde_json::to_vec(counters).unwrap_or_default());
             }
+            Self::LoadedMap(map) => {
+                log.push(Self::LOADED_MAP);
+                log.extend(serde_json::to_vec(map).unwrap_or_default());
+            }
             Self::Keyframe(keyframe) => {
                 log.push(Self::KEYFRAME);
                 log.extend(keyframe_bytes(keyframe));
@@ -150,6 +157,7 @@ impl Record {
         let record = match kind {
             Self::START => return serde_json::from_slice(payload).ok().map(Self::Start),
             Self::COUNTERS => return serde_json::from_slice(payload).ok().map(Self::Counters),
+            Self::LOADED_MAP => return serde_json::from_slice(payload).ok().map(Self::LoadedMap),
             Self::KEYFRAME => {
                 let keyframe = parse_keyframe(payload).ok()?;
                 return Some(Self::Keyframe(Box::new(keyframe)));
@@ -296,6 +304,12 @@ mod tests {
                 1,
                 KeyframePose { keyframe_id: 3, revision: 5, map_from_keyframe },
             ),
+            Record::LoadedMap(Box::new(LoadedMap {
+                folder: "/maps/hall".to_owned(),
+                read_only: true,
+                first_epoch: 2,
+                first_keyframe_id: 40,
+            })),
         ]
     }
 

@@ -11,7 +11,7 @@ use crate::service::journal::folder::{LOG, keyframe_file};
 use crate::service::journal::log::{Record, RunStart, read_log};
 use crate::service::map_file::read_map;
 use crate::service::recording::Recording;
-use crate::service::results::record::RunCounters;
+use crate::service::results::record::{LoadedMap, RunCounters};
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 
@@ -42,6 +42,8 @@ pub struct Recovered {
     pub ended: SystemTime,
     /// The last counters; at least as many frames as poses.
     pub counters: RunCounters,
+    /// The map that the mapper had switched to.
+    pub loaded_map: Option<LoadedMap>,
     /// Keyframes by id and the sequence of their frame, without image and points. Their epochs change where one is
     /// joined to another.
     keyframes: BTreeMap<(u64, u64), Keyframe>,
@@ -75,6 +77,7 @@ impl Recovered {
             start,
             recording: Recording::default(),
             counters: RunCounters::default(),
+            loaded_map: None,
             keyframes: BTreeMap::new(),
         }
     }
@@ -94,6 +97,7 @@ impl Recovered {
                 }
             }
             Record::Counters(counters) => self.counters = *counters,
+            Record::LoadedMap(map) => self.loaded_map = Some(*map),
             Record::Keyframe(keyframe) => {
                 self.keyframes.insert((keyframe.keyframe_id, keyframe.sequence), *keyframe);
             }

@@ -129,7 +129,7 @@ impl RunCounters {
 }
 
 /// A map that a running mapper was switched to.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LoadedMap {
     /// Its folder.
     pub folder: String,
