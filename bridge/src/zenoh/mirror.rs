@@ -40,6 +40,8 @@ pub struct Mirror {
     images: (usize, Publisher<u8, KeyframeImageHeader>),
     frames: (usize, Publisher<u8, FrameHeader>),
     health: [Reported; 3],
+    /// Whether anything but health was published since the last run was over.
+    has_content: bool,
     hub: Hub,
     _claims: Vec<Claim>,
 }
@@ -82,6 +84,7 @@ impl Mirror {
             images: (1, hub.publisher(&KEYFRAME_IMAGE, 1)?),
             frames: (1, hub.publisher(&FRAME, 1)?),
             health: [reported(0)?, reported(1)?, reported(2)?],
+            has_content: false,
             hub,
             _claims: claims,
         };
@@ -91,6 +94,7 @@ impl Mirror {
 
     /// Publishes an arrival, whose stamps are already those of this machine.
     pub fn publish(&mut self, arrival: &Arrival) -> Result<(), ZenohError> {
+        self.has_content |= !matches!(arrival, Arrival::Health(..) | Arrival::Presence(_));
         match arrival {
             Arrival::Pose(message) => self.poses.send((), &[**message])?,
             Arrival::Health(kind, message) => self.publish_health(*kind, message)?,
@@ -130,6 +134,7 @@ impl Mirror {
 
     /// Reports the cause of a silence once a second, as stale health. A finished process stays finished for a while.
     pub fn report_silence(&mut self, cause: &str) -> Result<(), ZenohError> {
+        self.forget_run_that_is_over()?;
         let now = now_nanos();
         for reported in &mut self.health {
             let since = now.saturating_sub(reported.told_nanos);
@@ -165,7 +170,27 @@ impl Mirror {
         reported.publisher.send((), &[reported.last])?;
         let now = now_nanos();
         (reported.told_nanos, reported.heard_nanos, reported.is_silent) = (now, now, false);
-        Ok(())
+        self.forget_run_that_is_over()
+    }
+
+    /// Once tracker and mapper have finished, opens the other topics anew: programs that have joined keep what they have
+    /// not read yet, and those that join later get nothing of a run that is over.
+    fn forget_run_that_is_over(&mut self) -> Result<(), ZenohError> {
+        let finished = ProcessState::Finished.code();
+        let is_over = self.health[1..].iter().all(|reported| reported.last.state == finished);
+        if !(is_over && std::mem::take(&mut self.has_content)) {
+            return Ok(());
+        }
+        // Whoever has joined just now is still to get them.
+        self.serve_late_joiners();
+        let hub = &self.hub;
+        self.poses = hub.publisher(&POSE, 1)?;
+        self.adjustments = hub.publisher(&ADJUSTMENT, 1)?;
+        self.graphs = hub.publisher(&GRAPH, MAX_GRAPH_KEYFRAMES)?;
+        self.keyframes = hub.publisher(&KEYFRAME, MAX_KEYFRAME_POINTS)?;
+        self.images.1 = hub.publisher(&KEYFRAME_IMAGE, self.images.0)?;
+        self.frames.1 = hub.publisher(&FRAME, self.frames.0)?;
+        Ok(hub.reserve()?)
     }
 }
 
@@ -173,6 +198,7 @@ impl Mirror {
 mod tests {
     use super::*;
     use semidense::service::peers::Peer;
+    use semidense::wire::port::Subscriber;
     use semidense::wire::topic::TRACKER_HEALTH;
 
     #[test]
@@ -200,6 +226,53 @@ mod tests {
             assert_eq!(tracker.state(), Some(state), "{age_nanos}");
         }
         drop((tracker, hub, mirror));
+        place.tidy();
+    }
+
+    #[test]
+    fn a_program_that_joins_after_the_end_gets_no_pose_of_the_run() {
+        let folder = tempfile::tempdir_in("/tmp").unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        let mut mirror = Mirror::open(&place).unwrap();
+        let hub = Hub::join(&place, "reader", Access::Observer).unwrap();
+        let join = || -> Subscriber<PoseMessage, ()> { hub.subscriber(&POSE).unwrap() };
+        let numbers = |port: &Subscriber<PoseMessage, ()>| {
+            let next = || port.receive().unwrap().map(|message| message.payload()[0].sequence);
+            std::iter::from_fn(next).collect::<Vec<u64>>()
+        };
+        let pose = |sequence| {
+            Arrival::Pose(Box::new(PoseMessage { sequence, ..PoseMessage::new_zeroed() }))
+        };
+        let health = |kind, state: ProcessState| {
+            let message = HealthMessage { state: state.code(), ..HealthMessage::new_zeroed() };
+            Arrival::Health(kind, Box::new(message))
+        };
+        let early = join();
+        for arrival in [
+            health(Kind::MapperHealth, ProcessState::Running),
+            health(Kind::TrackerHealth, ProcessState::Running),
+            pose(7),
+            health(Kind::TrackerHealth, ProcessState::Finished),
+        ] {
+            mirror.publish(&arrival).unwrap();
+        }
+        // Behind a cut link, or while the mapper still works, the last pose counts.
+        mirror.report_silence("the link is gone").unwrap();
+        let late = join();
+        mirror.serve_late_joiners();
+        assert_eq!(numbers(&late), [7]);
+        mirror.publish(&health(Kind::MapperHealth, ProcessState::Finished)).unwrap();
+        let too_late = join();
+        mirror.serve_late_joiners();
+        assert_eq!((numbers(&early), numbers(&too_late)), (vec![7], vec![]));
+        // Nor does the next run begin with it, or with one that arrives after the end.
+        mirror.publish(&pose(8)).unwrap();
+        mirror.report_silence("its instance is not running").unwrap();
+        let of_next = join();
+        mirror.publish(&health(Kind::TrackerHealth, ProcessState::Running)).unwrap();
+        mirror.publish(&pose(1)).unwrap();
+        assert_eq!(numbers(&of_next), [1]);
+        drop((early, late, too_late, of_next, hub, mirror));
         place.tidy();
     }
 }
