@@ -16,6 +16,10 @@ pub struct AlignmentParams {
     pub noise: ImageNoise,
     /// Whether the variance of the inverse depth weights the residuals (LSD14 §3.3); off only to measure its effect.
     pub use_depth_variance: bool,
+    /// Standard deviation of the error that neighbouring points share, as a share of the inverse depth: weights have it
+    /// in addition to the variance, which treats errors as independent and would let the most observed points lead
+    /// alone. Inliers are counted without it, so that a wrong pose is not excused; see `docs/depth-noise.md`.
+    pub common_depth_error: f32,
     /// Huber's k on |r|/σ_r; LSD-SLAM's 1.5 keeps 95 % efficiency on Gaussian noise.
     pub huber: f32,
     /// |r|/σ_r below which a point counts as inlier.
@@ -47,6 +51,7 @@ impl Default for AlignmentParams {
         Self {
             noise: ImageNoise::default(),
             use_depth_variance: true,
+            common_depth_error: 0.05,
             huber: 1.5,
             inlier_gate: 2.5,
             estimate_brightness: true,
@@ -65,6 +70,7 @@ impl Default for AlignmentParams {
 impl AlignmentParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("common_depth_error", self.common_depth_error, 0.0..=1.0)?;
         check_range("huber", self.huber, 0.1..=100.0)?;
         check_range("inlier_gate", self.inlier_gate, 0.1..=100.0)?;
         check_range("gain_prior_std_dev", self.gain_prior_std_dev, 1e-3..=1e3)?;

@@ -26,10 +26,6 @@ pub struct ReferenceParams {
     /// Maximum number of points of each level, finest first. A level with more keeps the most informative ones, evenly
     /// spread; these determine the time per frame.
     pub point_budget: [usize; MAX_LEVELS],
-    /// Standard deviation of the error that neighbouring points share, as a share of the inverse depth: it is added to
-    /// each variance, which treats errors as independent and would let the most observed points lead alone.
-    /// `docs/depth-noise.md` has the figures.
-    pub common_depth_error: f32,
     /// How the points of a level are chosen.
     pub selection: SelectionParams,
 }
@@ -39,7 +35,6 @@ impl Default for ReferenceParams {
         Self {
             finest_level: 1,
             point_budget: [12_000, 8_000, 5_000, 2_500, 1_200],
-            common_depth_error: 0.05,
             selection: SelectionParams::default(),
         }
     }
@@ -52,7 +47,6 @@ impl ReferenceParams {
         for (level, &budget) in self.point_budget.iter().enumerate() {
             check_range(&format!("point_budget[{level}]"), budget, 100..=100_000)?;
         }
-        check_range("common_depth_error", self.common_depth_error, 0.0..=1.0)?;
         self.selection.validate().map_err(|error| error.within("selection"))
     }
 }
@@ -262,12 +256,11 @@ impl Reference {
             }
             let at = |u: usize, v: usize| f32::from(image.at(u, v)) * grey_per_sum(level);
             let tile = tile_of(u, v, image.width(), image.height());
-            let common = self.params.common_depth_error * candidate.inverse_depth;
             let point = Point {
                 ray_x: ((u as f64 - intrinsics.cx) * inverse_fx) as f32,
                 ray_y: ((v as f64 - intrinsics.cy) * inverse_fy) as f32,
                 inverse_depth: candidate.inverse_depth,
-                variance: candidate.variance + common * common,
+                variance: candidate.variance,
                 surrounding_inverse_depth: if is_finest {
                     surroundings.mean_excluding(&candidate)
                 } else {

@@ -1,13 +1,13 @@
 //! The residual of a point, its variance and its Jacobian, and their sums over a level.
 //!
-//! With the keyframe's ray x = (x, y, 1), inverse depth d and variance V, and everything scaled by d so that distant
+//! With the keyframe's ray x = (x, y, 1), inverse depth d, variance V and common error c, and everything scaled by d so that distant
 //! points stay finite (`spec` letters):
 //! ```text
 //! X̃  = R x + t d = (x̃, ỹ, z̃)          p' = π(X̃)        n = (x̃, ỹ)/z̃
 //! r   = I(p') − (eᵃ I_k + b)            a_x = g_x f_x     a_y = g_y f_y     m = a_x n_x + a_y n_y
 //! J_t = d/z̃ (a_x, a_y, −m)             J_r = (−a_y − n_y m, a_x + n_x m, n_x a_y − n_y a_x)
 //! ∂r/∂d = (a_x t_x + a_y t_y − m t_z)/z̃
-//! σ_r² = (1 + e²ᵃ) σ_I² + (∂r/∂d)² V
+//! σ_r² = (1 + e²ᵃ) σ_I² + (∂r/∂d)² (V + c² d²)
 //! ```
 //! g, the gradient of the new image at p', is taken from the keyframe, which shows the same surface: eᵃ W⁻ᵀ g_k, with W
 //! the derivative of the warp at constant d. A gradient sampled from the new image between the pixels that give I(p')
@@ -54,6 +54,7 @@ pub struct Evaluation {
     pub(crate) offset: f32,
     pub(crate) intensity_variance: f32,
     pub(crate) depth_variance_factor: f32,
+    pub(crate) common_variance_factor: f32,
     pub(crate) huber: f32,
     pub(crate) inlier_gate_squared: f32,
 }
@@ -72,6 +73,7 @@ impl Evaluation {
     ) -> Self {
         let rotation = current_from_keyframe.rotation_matrix();
         let gain = brightness.a.exp() as f32;
+        let depth_variance_factor = if params.use_depth_variance { 1.0 } else { 0.0 };
         // The last pixel that has a right and a lower neighbour, less the border.
         let upper = |side: usize| side as f32 - 1.0 - BORDER_PX;
         Self {
@@ -85,7 +87,8 @@ impl Evaluation {
             gain,
             offset: brightness.b as f32,
             intensity_variance: (1.0 + gain * gain) * params.noise.variance(level),
-            depth_variance_factor: if params.use_depth_variance { 1.0 } else { 0.0 },
+            depth_variance_factor,
+            common_variance_factor: depth_variance_factor * params.common_depth_error.powi(2),
             huber: params.huber,
             inlier_gate_squared: params.inlier_gate * params.inlier_gate,
         }
@@ -116,6 +119,8 @@ pub struct PointTerms {
     pub is_clipped: bool,
     /// σ_r², grey levels².
     pub variance: f32,
+    /// The same without the error that neighbouring points share: the measure of an inlier.
+    pub own_variance: f32,
     /// ∂r/∂d, grey levels · keyframe units.
     pub inverse_depth_derivative: f32,
     /// ∂r/∂(translation, rotation, a, b).
@@ -132,7 +137,10 @@ pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option
     let along = |[x, y, z]: [f32; 3]| -> f32 { (ax * x + ay * y - m * z) * inverse_ratio };
     let inverse_depth_derivative = along(at.translation);
     let weighing_derivative = along(at.variance_translation);
-    let from_depth = weighing_derivative * weighing_derivative * point.variance;
+    let squared_derivative = weighing_derivative * weighing_derivative;
+    let from_depth = squared_derivative * point.variance;
+    let own_variance = at.intensity_variance + at.depth_variance_factor * from_depth;
+    let squared_depth = point.inverse_depth * point.inverse_depth;
     let predicted = at.gain * point.intensity;
     let residual = value - (predicted + at.offset);
     let [darkest, lightest] = UNCLIPPED_GREY;
@@ -141,7 +149,8 @@ pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option
         projection: [u, v],
         residual,
         is_clipped: (value > lightest && residual < 0.0) || (value < darkest && residual > 0.0),
-        variance: at.intensity_variance + at.depth_variance_factor * from_depth,
+        variance: own_variance + at.common_variance_factor * (squared_derivative * squared_depth),
+        own_variance,
         inverse_depth_derivative,
         jacobian: [
             scale * ax,
@@ -234,7 +243,7 @@ pub fn accumulate_reference(
         sums.energy += f64::from(huber_weight * (2.0 - huber_weight) * normalized);
         sums.squared_residual += f64::from(squared);
         sums.compared += 1;
-        sums.inliers += u32::from(normalized < at.inlier_gate_squared);
+        sums.inliers += u32::from(squared / terms.own_variance < at.inlier_gate_squared);
         let residual = f64::from(terms.residual);
         let jacobian = terms.jacobian.map(f64::from);
         for i in 0..UNKNOWNS {

@@ -26,9 +26,12 @@ fn pyramid(pixels: &[u8]) -> SumPyramid {
 }
 
 fn evaluation(pose: &SE3, brightness: Brightness) -> Evaluation {
-    let params = AlignmentParams::default();
+    evaluation_with(&AlignmentParams::default(), pose, brightness)
+}
+
+fn evaluation_with(params: &AlignmentParams, pose: &SE3, brightness: Brightness) -> Evaluation {
     let (camera, translation) = (small_camera().at_level(LEVEL), &pose.translation);
-    Evaluation::new(&camera, LEVEL, pose, brightness, &params, translation)
+    Evaluation::new(&camera, LEVEL, pose, brightness, params, translation)
 }
 
 fn move_of(seed: u64, size: f64) -> SE3 {
@@ -145,14 +148,34 @@ fn under_translation_along_x_depth_variance_affects_only_gradients_along_x() {
     let mut seen = (0, 0);
     for (point, variance, image) in variances {
         let excess = variance - image;
-        // (g_x f_x t_x)² V to first order, whatever g_y is.
+        // (g_x f_x t_x)² (V + c² d²) to first order, whatever g_y is.
         let focal = small_camera().at_level(LEVEL).fx as f32;
-        let expected = (point.gradient_x * focal * 0.1).powi(2) * point.variance;
+        let common = AlignmentParams::default().common_depth_error * point.inverse_depth;
+        let of_depth = point.variance + common * common;
+        let expected = (point.gradient_x * focal * 0.1).powi(2) * of_depth;
         assert!((excess - expected).abs() <= 0.01 * expected + 1e-3, "{excess}, {expected}");
         seen.0 += usize::from(expected < 0.01 * image && point.gradient_y.abs() > 5.0);
         seen.1 += usize::from(expected > image);
     }
     assert!(seen.0 > 10 && seen.1 > 100, "{seen:?}");
+}
+
+#[test]
+fn an_error_that_neighbours_share_lowers_weights_but_excuses_no_outlier() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.02));
+    // Half a pixel to two from the truth: some residuals are outliers.
+    let pose = SE3::exp(&Vector6::new(0.1, 0.0, 0.0, 0.0, 0.01, 0.0));
+    let image = pyramid(&plane.render(&camera, &SE3::identity(), 2.0, (1.0, 0.0), 1));
+    let sums = [0.0, 0.2].map(|common_depth_error| {
+        let params = AlignmentParams { common_depth_error, ..AlignmentParams::default() };
+        let at = evaluation_with(&params, &pose, Brightness::default());
+        accumulate_reference(reference.level(LEVEL), image.level(LEVEL), &at)
+    });
+    let [without, with] = sums;
+    assert!(without.inliers > 0 && without.inliers < without.compared);
+    assert_eq!(with.inliers, without.inliers);
+    assert!(with.energy < 0.9 * without.energy, "{} {}", with.energy, without.energy);
 }
 
 #[test]

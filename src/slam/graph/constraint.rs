@@ -55,15 +55,12 @@ impl Default for ConstraintParams {
         /// Points per level, finest first: a third of a frame's, since nine unknowns need no more and two alignments
         /// are made.
         const POINT_BUDGET: [usize; MAX_LEVELS] = [4000, 4000, 3000, 2000, 1200];
+        let reference = ReferenceParams { point_budget: POINT_BUDGET, ..Default::default() };
         // The keyframes of a loop have been estimated jointly: what neighbouring points shared is gone.
-        let reference = ReferenceParams {
-            point_budget: POINT_BUDGET,
-            common_depth_error: 0.0,
-            ..Default::default()
-        };
+        let alignment = AlignmentParams { common_depth_error: 0.0, ..Default::default() };
         Self {
             reference,
-            alignment: AlignmentParams::default(),
+            alignment,
             step_tolerance: 0.1,
             depth_model_ratio: 0.01,
             coarse_depth_ratio: 0.2,

@@ -86,7 +86,11 @@ impl Finder {
         let Intrinsics { width, height, .. } = *intrinsics;
         let reference = ReferenceParams::default();
         let levels = num_levels(width, height);
-        let alignment = AlignmentParams { simd: SimdMode::Portable, ..Default::default() };
+        let alignment = AlignmentParams {
+            simd: SimdMode::Portable,
+            common_depth_error: 0.0,
+            ..Default::default()
+        };
         Self {
             camera: *intrinsics,
             aligner: Aligner::new(alignment),

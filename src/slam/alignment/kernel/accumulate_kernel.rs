@@ -50,14 +50,15 @@ impl<R: Register> Statistics<R> {
         Self { energy: zero, squared_residual: zero, in_view: 0, compared: 0, inliers: 0 }
     }
 
-    /// Counts the compared residuals; returns their weights, including Huber's.
+    /// Counts the compared residuals; returns their weights, including Huber's. `own` is the variance that inliers are
+    /// measured by.
     #[inline(always)]
     fn weigh<I: Instructions<Register = R>>(
         &mut self,
         lanes: I,
         at: &Evaluation,
         r: Lanes<R>,
-        variance: Lanes<R>,
+        [variance, own]: [Lanes<R>; 2],
         is_compared: Mask<R>,
     ) -> Lanes<R> {
         let (zero, one) = (lanes.splat(0.0), lanes.splat(1.0));
@@ -65,7 +66,7 @@ impl<R: Register> Statistics<R> {
         let information = one / variance;
         let normalized = squared * information;
         let huber = (lanes.splat(at.huber) / normalized.sqrt()).min(one);
-        let inlier = lanes.splat(at.inlier_gate_squared).greater(normalized);
+        let inlier = (lanes.splat(at.inlier_gate_squared) * own).greater(squared);
         self.compared += is_compared.count();
         self.inliers += (is_compared & inlier).count();
         let energy = huber * (lanes.splat(2.0) - huber) * normalized;
@@ -135,11 +136,13 @@ pub fn whiten<I: Instructions>(
     let m = ax.mul_add(nx, ay * ny);
     let [wx, wy, wz] = at.variance_translation.map(|value| lanes.splat(value));
     let weighing = ax.mul_add(wx, ay.mul_add(wy, (zero - m) * wz)) * inverse_ratio;
-    let from_depth = weighing * weighing * load(&block.variance);
+    let (squared, d) = (weighing * weighing, load(&block.inverse_depth));
+    let from_depth = squared * load(&block.variance);
     let factor = lanes.splat(at.depth_variance_factor);
-    let variance = from_depth.mul_add(factor, lanes.splat(at.intensity_variance));
+    let own = from_depth.mul_add(factor, lanes.splat(at.intensity_variance));
+    let variance = (squared * (d * d)).mul_add(lanes.splat(at.common_variance_factor), own);
     statistics.in_view += in_view.count();
-    let root = statistics.weigh(lanes, at, residual, variance, is_compared).sqrt();
+    let root = statistics.weigh(lanes, at, residual, [variance, own], is_compared).sqrt();
 
     let translation = load(&block.surrounding_inverse_depth) * inverse_ratio;
     let columns = [
