@@ -1,7 +1,7 @@
 //! The residual of a point, its variance and its Jacobian, and their sums over a level.
 //!
-//! With the keyframe's ray x = (x, y, 1), inverse depth d, variance V and common error c, and everything scaled by d so that distant
-//! points stay finite (`spec` letters):
+//! With the keyframe's ray x = (x, y, 1), inverse depth d, its variance V and its error c common to neighbours, and
+//! everything scaled by d so that distant points stay finite (`spec` letters):
 //! ```text
 //! X̃  = R x + t d = (x̃, ỹ, z̃)          p' = π(X̃)        n = (x̃, ỹ)/z̃
 //! r   = I(p') − (eᵃ I_k + b)            a_x = g_x f_x     a_y = g_y f_y     m = a_x n_x + a_y n_y

@@ -46,10 +46,10 @@ impl Appearance {
         Self { greys, details }
     }
 
-    /// This image from another viewpoint: `seen_at` tells which of its pixels shows what each pixel of that shows. Where
-    /// none does, the mean grey lowers the similarity to anything.
-    pub(in crate::slam) fn resampled(&self, seen_at: impl Fn(usize) -> Option<usize>) -> Self {
-        let grey = |pixel| seen_at(pixel).and_then(|at| self.greys.get(at).copied());
+    /// This image from another viewpoint: `seen_at` gives the pixel of this image that shows what a pixel from there
+    /// shows. Where it is none of them, the mean grey lowers the similarity to anything.
+    pub(in crate::slam) fn resampled(&self, seen_at: impl Fn(usize) -> usize) -> Self {
+        let grey = |pixel| self.greys.get(seen_at(pixel)).copied();
         let greys: Vec<Option<f32>> = (0..COLUMNS * ROWS).map(grey).collect();
         let count = greys.iter().flatten().count().max(1);
         let mean = greys.iter().flatten().sum::<f32>() / count as f32;

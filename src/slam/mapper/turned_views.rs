@@ -109,8 +109,7 @@ pub(in crate::slam) fn turned_back(
     rotation: &UnitQuaternion<f64>,
 ) -> Appearance {
     let camera_from_keyframe = rotation.inverse().to_rotation_matrix();
-    // `OUTSIDE` is no pixel of the frame.
-    frame.resampled(|pixel| Some(usize::from(seen_at(camera, &camera_from_keyframe, pixel))))
+    frame.resampled(|pixel| seen_at(camera, &camera_from_keyframe, pixel).into())
 }
 
 /// The camera's pixel that sees a distant point at a pixel of the keyframe.
