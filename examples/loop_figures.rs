@@ -70,6 +70,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     let mut source = open(&arguments.source, None, &SourceParams::default())?;
     let config = Config::default();
     let config = ReplayConfig {
+        mask: None,
         map: Default::default(),
         tracker: config.tracking,
         mapper: config.mapping,

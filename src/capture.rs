@@ -16,6 +16,7 @@ pub(crate) mod input_file;
 pub(crate) mod jpeg_image;
 pub(crate) mod listing;
 pub(crate) mod looped;
+pub mod mask;
 pub mod opening;
 pub mod png_image;
 pub(crate) mod recording;

@@ -171,6 +171,10 @@ impl FrameSource for Bag {
         self.rectifier.intrinsics()
     }
 
+    fn rectified(&self, raw: &[u8]) -> Vec<u8> {
+        self.rectifier.rectified(raw)
+    }
+
     fn num_frames(&self) -> Option<usize> {
         usize::try_from(self.contents.num_images).ok()
     }

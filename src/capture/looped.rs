@@ -59,6 +59,10 @@ impl FrameSource for Looped {
         self.inner.intrinsics()
     }
 
+    fn rectified(&self, raw: &[u8]) -> Vec<u8> {
+        self.inner.rectified(raw)
+    }
+
     fn num_frames(&self) -> Option<usize> {
         usize::try_from(self.num_frames).ok()
     }

@@ -83,6 +83,10 @@ impl FrameSource for Recording {
         self.rectifier.intrinsics()
     }
 
+    fn rectified(&self, raw: &[u8]) -> Vec<u8> {
+        self.rectifier.rectified(raw)
+    }
+
     fn num_frames(&self) -> Option<usize> {
         Some(self.contents.frames.len())
     }

@@ -68,6 +68,15 @@ impl Rectifier {
         })
     }
 
+    /// Rectifies a raw grey image.
+    pub fn rectified(&self, raw: &[u8]) -> Vec<u8> {
+        let mut rectified = raw.to_vec();
+        if !self.rectification.is_identity() {
+            self.rectification.rectify_into(raw, &mut rectified);
+        }
+        rectified
+    }
+
     /// Rectifies a raw depth image; `None` if it has another size.
     pub fn rectify_depth(&self, raw: &Image<f32>) -> Option<Image<f32>> {
         self.rectification.rectify_depth(raw)

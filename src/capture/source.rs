@@ -85,6 +85,11 @@ pub trait FrameSource: Send {
     /// Intrinsics of the rectified frames.
     fn intrinsics(&self) -> Intrinsics;
 
+    /// An image of this source's camera, `width * height` pixels, rectified like the frames.
+    fn rectified(&self, raw: &[u8]) -> Vec<u8> {
+        raw.to_vec()
+    }
+
     /// Total number of frames, if known (recordings, simulator).
     fn num_frames(&self) -> Option<usize> {
         None

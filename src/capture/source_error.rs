@@ -114,6 +114,14 @@ pub enum SourceError {
     /// An image of the sequence is not usable.
     #[error(transparent)]
     Image(#[from] ImageFileError),
+    /// A mask does not belong to the camera, or hides almost everything.
+    #[error("{}: {problem}", path.display())]
+    Mask {
+        /// The mask's file.
+        path: PathBuf,
+        /// The problem, and what to do.
+        problem: String,
+    },
     /// A camera or a stream of frames cannot be used.
     #[error("{name}: {reason}")]
     Camera {

@@ -261,6 +261,10 @@ impl FrameSource for StreamSource {
         self.rectifier.intrinsics()
     }
 
+    fn rectified(&self, raw: &[u8]) -> Vec<u8> {
+        self.rectifier.rectified(raw)
+    }
+
     fn await_frame(&mut self, wake: BorrowedFd<'_>, millis: u32) -> Result<Arrival, SourceError> {
         let now = nanos_of(ClockId::Monotonic);
         if self.poll(now)? == Arrival::Frame {

@@ -102,6 +102,10 @@ impl<S: VideoSystem> FrameSource for CameraSource<S> {
         self.rectifier.intrinsics()
     }
 
+    fn rectified(&self, raw: &[u8]) -> Vec<u8> {
+        self.rectifier.rectified(raw)
+    }
+
     fn await_frame(&mut self, wake: BorrowedFd<'_>, millis: u32) -> Result<Arrival, SourceError> {
         self.camera.await_frame(Some(wake), millis).map_err(|reason| self.failed(reason))
     }

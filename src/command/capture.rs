@@ -46,6 +46,10 @@ pub struct SourceArguments {
     /// the configuration, for the source configured there]
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
+    /// Mask of the camera: an image of it, unrectified, black where it sees the robot itself and white elsewhere
+    /// [default: capture.mask of the configuration, for the source configured there]
+    #[arg(long, value_name = "FILE")]
+    mask: Option<PathBuf>,
     /// Stop with an error at a damaged or missing image of a recording; otherwise such an image is skipped,
     /// counted and reported [default: capture.strict of the configuration]
     #[arg(long)]
@@ -53,28 +57,39 @@ pub struct SourceArguments {
 }
 
 impl SourceArguments {
-    /// Source and rig from the command line, else from the configuration. A source named on the command line
-    /// does not use the configured rig, which belongs to another camera.
-    pub fn source_and_rig(
-        self,
-        config: &CaptureConfig,
-    ) -> Result<(SourceName, Option<PathBuf>), SourceError> {
-        let configured = (!config.rig.is_empty()).then(|| PathBuf::from(&config.rig));
-        match self.source.or(self.source_option) {
-            Some(source) => {
-                let source = SourceName::parse(&source)?;
-                if let (Some(rig), None) = (configured, &self.rig) {
-                    note(&format!(
-                        "warning: capture.rig ({}) belongs to the configured source and is not used for {source}; \
-                         name a rig with --rig FILE",
-                        rig.display()
-                    ));
-                }
-                Ok((source, self.rig))
+    /// The source from the command line, else from the configuration. One named on the command line does not use the
+    /// configured rig and mask, which belong to another camera.
+    pub fn named(self, config: &CaptureConfig) -> Result<NamedSource, SourceError> {
+        let [rig, mask] =
+            [&config.rig, &config.mask].map(|path| (!path.is_empty()).then(|| PathBuf::from(path)));
+        let Some(source) = self.source.or(self.source_option) else {
+            let (rig, mask) = (self.rig.or(rig), self.mask.or(mask));
+            return Ok(NamedSource { name: config.source.parse()?, rig, mask });
+        };
+        let name = SourceName::parse(&source)?;
+        let files = [("rig", rig, &self.rig), ("mask", mask, &self.mask)];
+        for (kind, configured, named) in files {
+            if let (Some(path), None) = (configured, named) {
+                note(&format!(
+                    "warning: capture.{kind} ({}) belongs to the configured source and is not used for {name}; \
+                     name a {kind} with --{kind} FILE",
+                    path.display()
+                ));
             }
-            None => Ok((config.source.parse()?, self.rig.or(configured))),
         }
+        Ok(NamedSource { name, rig: self.rig, mask: self.mask })
     }
+}
+
+/// A source and the files that belong to its camera.
+#[derive(Debug, Clone)]
+pub struct NamedSource {
+    /// Where frames come from.
+    pub name: SourceName,
+    /// The camera's rig file.
+    pub rig: Option<PathBuf>,
+    /// The camera's mask.
+    pub mask: Option<PathBuf>,
 }
 
 /// How frames are paced.
@@ -110,10 +125,10 @@ pub fn usual_mode(source: &SourceName) -> Mode {
 pub fn run(config: &Config, arguments: CaptureArguments) -> CommandResult {
     let mut config = config.clone();
     config.capture.strict |= arguments.source.strict;
-    let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
+    let NamedSource { name: source, rig, mask } = arguments.source.named(&config.capture)?;
     let mode = arguments.mode.mode(usual_mode(&source));
     let shutdown = Shutdown::install()?;
-    let options = CaptureOptions { source, rig, mode };
+    let options = CaptureOptions { source, rig, mask, mode };
     match run_shell(&config, &options, &shutdown) {
         Ok(()) => Ok(ExitCode::SUCCESS),
         Err(RunError::Interrupted) => Ok(ExitCode::from(INTERRUPTED)),

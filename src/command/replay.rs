@@ -7,11 +7,12 @@ use std::process::ExitCode;
 
 use clap::Args;
 
+use crate::capture::mask::Mask;
 use crate::capture::opening::{open, rig_remarks};
 use crate::capture::source::FrameSource;
 use crate::capture::source_name::SourceName;
 use crate::command::INTERRUPTED;
-use crate::command::capture::SourceArguments;
+use crate::command::capture::{NamedSource, SourceArguments};
 use crate::command::ending::{Ending, journal_options, print_unfinished};
 use crate::command::map::MapOptions;
 use crate::command::map_points::MapPointOptions;
@@ -82,7 +83,7 @@ type SentError = dyn Error + Send + Sync;
 
 /// Replays the sequence, writes the results and prints the summary.
 pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
-    let (name, rig) = args.source.clone().source_and_rig(&config.capture)?;
+    let NamedSource { name, rig, mask } = args.source.clone().named(&config.capture)?;
     let (args, config) = (&args, &meant_config(config, &args, &name)?);
     give_back_large_blocks();
     let shutdown = Shutdown::install_final(INTERRUPTED)?;
@@ -96,6 +97,9 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
     for remark in rig_remarks(&name, rig.as_deref()) {
         note(&format!("warning: {remark}"));
     }
+    let read_mask = |path: &PathBuf| Mask::read(path, source.as_ref());
+    let mask = mask.as_ref().map(read_mask).transpose()?;
+    let replay_config = ReplayConfig { mask, ..replay_config(config, args) };
     let threads = args.threads.map_or(config.mapper.threads, usize::from);
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
@@ -106,7 +110,7 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
     journal.start.is_depth_from_sensor = args.initial_depth == DepthOrigin::Sensor;
     let begin = || ReplayJournal::begin(&journal, &place);
     let replayed = pool.install(|| {
-        record(config, args, &name.to_string(), source.as_mut(), &shutdown, &begin)
+        record(&replay_config, &name.to_string(), source.as_mut(), &shutdown, &begin)
             .map_err(|error| error.to_string())
     })?;
     let Some(Replayed { record, journal }) = replayed else {
@@ -163,8 +167,7 @@ struct Replayed {
 
 /// Prepares the source and replays it with a progress bar; `None` if a signal arrived before the first frame.
 fn record(
-    config: &Config,
-    args: &ReplayArgs,
+    config: &ReplayConfig,
     source_name: &str,
     source: &mut dyn FrameSource,
     shutdown: &Shutdown,
@@ -181,7 +184,6 @@ fn record(
     if !should_continue() {
         return Ok(None);
     }
-    let config = replay_config(config, args);
     let total = source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)));
     let progress = Progress::new("replay", total);
     let mut journal = begin_journal()
@@ -191,7 +193,7 @@ fn record(
             )
         })
         .ok();
-    let replayed = replay(source, source_name, &config, &mut |frame| {
+    let replayed = replay(source, source_name, config, &mut |frame| {
         progress.update(frame.done, frame.state.name());
         journal.iter_mut().for_each(|journal| journal.observe(frame));
         should_continue()
@@ -226,5 +228,6 @@ fn replay_config(config: &Config, args: &ReplayArgs) -> ReplayConfig {
         max_frames: args.frames.map(|frames| frames as usize),
         strict: config.capture.strict,
         brighten: config.capture.brighten,
+        mask: None,
     }
 }

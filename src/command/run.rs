@@ -10,7 +10,7 @@ use clap::Args;
 
 use crate::capture::source_name::SourceName;
 use crate::command::bridge::bridge;
-use crate::command::capture::{ModeArguments, SourceArguments, usual_mode};
+use crate::command::capture::{ModeArguments, NamedSource, SourceArguments, usual_mode};
 use crate::command::ending::{Ending, journal_options, print_unfinished};
 use crate::command::map::MapOptions;
 use crate::command::map_points::MapPointOptions;
@@ -69,7 +69,7 @@ pub fn run(
     let child_arguments = child_arguments(common, &arguments, &map);
     let results = arguments.points.of(&config.results);
     let config = &Config { map, results, ..config.clone() };
-    let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
+    let NamedSource { name: source, rig, mask } = arguments.source.named(&config.capture)?;
     let mode = arguments.mode.mode(usual_mode(&source));
     let place = Place::new(&config.instance, &config.root)?;
     // Otherwise a lack of file descriptors would be blamed on whatever is opened next.
@@ -91,6 +91,7 @@ pub fn run(
     let options = RunOptions {
         source,
         rig,
+        mask,
         mode,
         output: output.path().to_owned(),
         keeps_map: true,

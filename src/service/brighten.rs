@@ -1,10 +1,12 @@
-//! A source whose dim images are brightened as they are read. That they are dim is logged in any case.
+//! A source whose dim images are brightened as they are read, and whose mask hides what is not the scene. That images
+//! are dim is logged in any case.
 
 use std::collections::VecDeque;
 use std::fs::File;
 use std::ops::DerefMut;
 use std::os::fd::BorrowedFd;
 
+use crate::capture::mask::{Mask, mark_hidden};
 use crate::capture::source::{Arrival, FrameLosses, FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -18,6 +20,7 @@ pub(crate) struct Brightened<S> {
     source: S,
     /// Whether frames are changed; otherwise their light is only measured.
     is_on: bool,
+    mask: Option<Mask>,
     brightening: Brightening,
     /// Largest factor so far.
     max_factor: u8,
@@ -42,10 +45,20 @@ where
     S: DerefMut + Send,
     S::Target: FrameSource,
 {
-    /// Brightens the frames of `source` if that `is_on`.
-    pub fn new(source: S, is_on: bool) -> Self {
+    /// Brightens the frames of `source` if that `is_on`, and hides the pixels of `mask`.
+    pub fn new(source: S, is_on: bool, mask: Option<Mask>) -> Self {
+        if let Some(mask) = &mask {
+            tracing::info!("the mask hides {:.0} % of the image", 100.0 * mask.hidden());
+        }
         let (brightening, ahead) = (Brightening::default(), VecDeque::new());
-        Self { source, is_on, brightening, max_factor: 1, ahead }
+        Self { source, is_on, mask, brightening, max_factor: 1, ahead }
+    }
+
+    /// Reads the source's next frame.
+    fn read_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+        let stamp = self.source.next_into(pixels)?;
+        mark_hidden(self.mask.as_ref(), pixels);
+        Ok(stamp)
     }
 
     /// The largest factor by which grey levels were multiplied; `None` where brightening is off.
@@ -67,7 +80,7 @@ where
     fn read_ahead(&mut self) {
         let Intrinsics { width, height, .. } = self.source.intrinsics();
         let mut pixels = vec![0; width * height];
-        let stamp = self.source.next_into(&mut pixels);
+        let stamp = self.read_into(&mut pixels);
         self.ahead.push_back(AheadFrame { stamp, pixels });
     }
 
@@ -104,6 +117,10 @@ where
 {
     fn intrinsics(&self) -> Intrinsics {
         self.source.intrinsics()
+    }
+
+    fn rectified(&self, raw: &[u8]) -> Vec<u8> {
+        self.source.rectified(raw)
     }
 
     fn num_frames(&self) -> Option<usize> {
@@ -145,7 +162,7 @@ where
                 pixels.copy_from_slice(&frame.pixels);
                 frame.stamp?
             }
-            None => self.source.next_into(pixels)?,
+            None => self.read_into(pixels)?,
         };
         if stamp.is_some() {
             self.brighten(pixels);
@@ -206,7 +223,11 @@ mod tests {
     }
 
     fn brightened(greys: impl IntoIterator<Item = Option<u8>>) -> Brightened<Box<Greys>> {
-        Brightened::new(Box::new(Greys { greys: greys.into_iter().collect(), num_read: 0 }), true)
+        Brightened::new(
+            Box::new(Greys { greys: greys.into_iter().collect(), num_read: 0 }),
+            true,
+            None,
+        )
     }
 
     /// Number and grey level of the next frame.

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use crate::capture::mask::Mask;
 use crate::capture::opening::{check_size, open, rig_remarks};
 use crate::capture::source::{Arrival, FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
@@ -41,6 +42,8 @@ pub struct CaptureOptions {
     pub source: SourceName,
     /// The camera's rig file.
     pub rig: Option<PathBuf>,
+    /// The camera's mask.
+    pub mask: Option<PathBuf>,
     /// Lockstep or live.
     pub mode: Mode,
 }
@@ -123,7 +126,9 @@ impl<'a> Shell<'a> {
         }
         let rig = options.rig.as_deref();
         let source = open(&options.source, rig, &config.source_params())?;
-        let source = Brightened::new(source, config.capture.brighten);
+        let read_mask = |path: &PathBuf| Mask::read(path, source.as_ref());
+        let mask = options.mask.as_ref().map(read_mask).transpose()?;
+        let source = Brightened::new(source, config.capture.brighten, mask);
         for remark in rig_remarks(&options.source, rig) {
             tracing::warn!("{remark}");
         }

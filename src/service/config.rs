@@ -79,6 +79,9 @@ pub struct CaptureConfig {
     /// The camera's rig file unless `--rig` names one; empty for none. In a configuration file a path is relative to
     /// that file.
     pub rig: String,
+    /// The camera's mask unless `--mask` names one; empty for none: an image of the camera, unrectified, black where it
+    /// sees the robot itself and white elsewhere. In a configuration file a path is relative to that file.
+    pub mask: String,
     /// Whether a damaged or missing image of a recording ends the run with an error, as `--strict` does; otherwise it
     /// is left out and counted.
     pub strict: bool,
@@ -99,6 +102,7 @@ impl Default for CaptureConfig {
         Self {
             source: "sim".to_owned(),
             rig: String::new(),
+            mask: String::new(),
             strict: false,
             brighten: true,
             connect_timeout_s: 30.0,
@@ -209,6 +213,7 @@ impl Config {
         if let Some(path) = file {
             table = Self::read_table(path)?;
             place_beside(&mut table, path, ["capture", "rig"]);
+            place_beside(&mut table, path, ["capture", "mask"]);
             place_beside(&mut table, path, ["map", "folder"]);
         }
         let mut config = Self::from_table(&table, "the built-in configuration")?;

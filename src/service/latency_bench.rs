@@ -192,6 +192,7 @@ pub(super) fn bench_options(
     let options = RunOptions {
         source: SourceName::Looped { num_frames, rate_hz, inner: Box::new(source.clone()) },
         rig: None,
+        mask: None,
         mode: Mode::Live,
         output: PathBuf::new(),
         keeps_map: false,

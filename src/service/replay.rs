@@ -9,6 +9,7 @@ use std::time::Instant;
 
 use clap::ValueEnum;
 
+use crate::capture::mask::Mask;
 use crate::capture::opening::check_size;
 use crate::capture::source::{FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
@@ -77,6 +78,8 @@ pub struct ReplayConfig {
     pub strict: bool,
     /// Whether dim images are brightened.
     pub brighten: bool,
+    /// Which pixels show the scene; `None` for all.
+    pub mask: Option<Mask>,
 }
 
 impl Default for ReplayConfig {
@@ -90,6 +93,7 @@ impl Default for ReplayConfig {
             max_frames: None,
             strict: false,
             brighten: true,
+            mask: None,
         }
     }
 }
@@ -183,7 +187,7 @@ pub fn replay(
     };
     let begin = Instant::now();
     let mut refused = RefusedImages::default();
-    let mut source = Brightened::new(source, config.brighten);
+    let mut source = Brightened::new(source, config.brighten, config.mask.clone());
     let fault = std::thread::scope(|scope| {
         let frames = ReadAhead::start(scope, &mut source, plan).map_err(ReplayError::Thread)?;
         replay.run(&frames, total, &mut refused, observe)

@@ -6,6 +6,7 @@ use std::fs::File;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use crate::capture::mask::Mask;
 use crate::capture::opening::open;
 use crate::capture::source::FrameSource;
 use crate::capture::source_name::SourceName;
@@ -55,6 +56,8 @@ pub struct RunOptions {
     pub source: SourceName,
     /// The camera's rig file.
     pub rig: Option<PathBuf>,
+    /// The camera's mask.
+    pub mask: Option<PathBuf>,
     /// Lockstep or live.
     pub mode: Mode,
     /// Folder for results, which exists.
@@ -87,6 +90,8 @@ pub fn run(
     observe: &mut dyn FnMut(&RunProgress),
 ) -> Result<RunOutcome, RunError> {
     let source = open(&options.source, options.rig.as_deref(), &config.source_params())?;
+    // Capture reads it too; here before any process is started.
+    options.mask.as_ref().map(|mask| Mask::read(mask, source.as_ref())).transpose()?;
     check_camera(&config.map, &source.intrinsics()).map_err(MapSessionError::from)?;
     let place = Place::new(&config.instance, &config.root)?;
     let _claim = claim_all(&place)?;
@@ -248,8 +253,9 @@ impl<'a> Supervisor<'a> {
         });
         if name == HEALTH_TOPICS[CAPTURE].owner {
             arguments.extend(["--source".into(), self.options.source.to_os_string()]);
-            if let Some(rig) = &self.options.rig {
-                arguments.extend(["--rig".into(), rig.clone().into_os_string()]);
+            let files = [("--rig", &self.options.rig), ("--mask", &self.options.mask)];
+            for (option, file) in files.into_iter().filter_map(|(o, f)| Some((o, f.as_ref()?))) {
+                arguments.extend([option.into(), file.clone().into_os_string()]);
             }
         }
         let is_capture = name == HEALTH_TOPICS[CAPTURE].owner;

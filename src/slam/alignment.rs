@@ -11,6 +11,8 @@ mod kernel;
 pub(crate) mod misfit;
 #[cfg(test)]
 mod mode_tests;
+#[cfg(test)]
+mod no_data_tests;
 pub(crate) mod normal_equations;
 mod params;
 pub mod points;

@@ -15,7 +15,8 @@ pub struct FrameView<'a> {
     pub width: usize,
     /// Height in pixels.
     pub height: usize,
-    /// Rows of `width` grey values without padding, `width * height` bytes.
+    /// Rows of `width` grey values without padding, `width * height` bytes; [`NO_DATA`](crate::slam::image::NO_DATA)
+    /// where it shows nothing of the scene.
     pub pixels: &'a [u8],
 }
 

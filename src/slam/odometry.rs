@@ -106,7 +106,8 @@ impl Odometry {
     /// Tracks the next frame and returns its pose. Sequence and stamp must increase; a frame of another size is not
     /// tracked. Until the camera has moved sideways by some per cent of the distance of the scene there is no map, and
     /// poses are `Initializing`. Grey levels are taken as given: brighten a dim camera's frames with
-    /// [`Brightening`](crate::slam::image::brightening::Brightening) first.
+    /// [`Brightening`](crate::slam::image::brightening::Brightening) first. Pixels of grey level
+    /// [`NO_DATA`](crate::slam::image::NO_DATA), 0, are ignored: raise black ones to 1.
     pub fn push(&mut self, frame: &FrameView<'_>) -> PoseEstimate {
         let pose = self.tracker.track(frame, &mut |_| true);
         let mut outcome = self.mapper.step(frame, &pose, None, &mut || {});

@@ -34,7 +34,7 @@ impl Rendering {
     pub fn noisy(&self, std_dev: f64, seed: u64) -> Vec<u8> {
         let mut random = Random::new(seed);
         let grey = |i: &f32| (f64::from(*i) + std_dev * random.normal()).round();
-        self.intensity.pixels().iter().map(grey).map(|i| i.clamp(0.0, 255.0) as u8).collect()
+        self.intensity.pixels().iter().map(grey).map(|i| i.clamp(1.0, 255.0) as u8).collect()
     }
 }
 

@@ -31,7 +31,7 @@ use crate::slam::depth::map::DepthMap;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
-use crate::slam::image::pyramid::Pyramid;
+use crate::slam::image::pyramid::{Pyramid, value};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
 use crate::slam::two_frame::covariance::{common_error, depth_variances, pose_covariance};
@@ -210,7 +210,10 @@ impl TwoFrameInitializer {
         let latest = self.pyramid.levels().first().map_or(&[][..], |level| level.pixels());
         !self.first_pixels.is_empty()
             && latest.len() == pixels.len()
-            && latest.iter().zip(pixels).all(|(latest, &grey)| *latest == f32::from(grey))
+            && latest
+                .iter()
+                .zip(pixels)
+                .all(|(latest, &grey)| latest.to_bits() == value(grey).to_bits())
     }
 
     /// Takes the next frame: fits, judges, and restarts where it must.

@@ -21,6 +21,7 @@ mod interval_filter;
 mod keyframe_reuse;
 mod map_correction;
 mod map_surface;
+mod mask;
 mod observation_noise;
 mod odometry;
 mod pose_graphs;

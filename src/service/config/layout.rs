@@ -12,11 +12,12 @@ use toml::{Table, Value};
 pub const EXPERT: &str = "expert";
 
 /// Keys outside `[expert]`: what a camera, a robot, a recording or a first try may need.
-const USER_KEYS: [&str; 42] = [
+const USER_KEYS: [&str; 43] = [
     "instance",
     "root",
     "capture.source",
     "capture.rig",
+    "capture.mask",
     "capture.strict",
     "capture.scheduling.policy",
     "capture.scheduling.priority",

@@ -147,12 +147,13 @@ fn tracker_and_mapper_agree_on_keyframe_distance() {
 fn later_settings_win() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("semidense.toml");
-    let text = "instance = \"rig2\"\n[mapper]\nthreads = 3\n[capture]\nrig = \"cam.toml\"\n";
+    let text = "instance = \"rig2\"\n[mapper]\nthreads = 3\n[capture]\nrig = \"cam.toml\"\nmask = \"arm.png\"\n";
     std::fs::write(&path, text).unwrap();
     let config = Config::load(Some(&path), &["mapper.threads=1".to_owned()]).unwrap();
     assert_eq!((config.instance.as_str(), config.mapper.threads), ("rig2", 1));
     // A path in a file is relative to that file, one on the command line is not.
     assert_eq!(Path::new(&config.capture.rig), folder.path().join("cam.toml"));
+    assert_eq!(Path::new(&config.capture.mask), folder.path().join("arm.png"));
     let config = Config::load(Some(&path), &["capture.rig=x.toml".to_owned()]).unwrap();
     assert_eq!(config.capture.rig, "x.toml");
     assert_eq!(set(&["instance=rig3"]).unwrap().instance, "rig3");

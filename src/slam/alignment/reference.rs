@@ -255,6 +255,11 @@ impl Reference {
                 continue;
             }
             let at = |u: usize, v: usize| f32::from(image.at(u, v)) * grey_per_sum(level);
+            let (beside, across) = ([at(u - 1, v), at(u + 1, v)], [at(u, v - 1), at(u, v + 1)]);
+            if at(u, v).min(beside[0]).min(beside[1]).min(across[0]).min(across[1]) == 0.0 {
+                // No data.
+                continue;
+            }
             let tile = tile_of(u, v, image.width(), image.height());
             let point = Point {
                 ray_x: ((u as f64 - intrinsics.cx) * inverse_fx) as f32,
@@ -267,8 +272,8 @@ impl Reference {
                     candidate.inverse_depth
                 },
                 intensity: at(u, v),
-                gradient_x: 0.5 * (at(u + 1, v) - at(u - 1, v)),
-                gradient_y: 0.5 * (at(u, v + 1) - at(u, v - 1)),
+                gradient_x: 0.5 * (beside[1] - beside[0]),
+                gradient_y: 0.5 * (across[1] - across[0]),
             };
             self.levels[level].push(point, tile);
         }

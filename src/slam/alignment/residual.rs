@@ -37,8 +37,8 @@ pub(crate) const NEAREST_DEPTH_RATIO: f32 = 0.1;
 pub(crate) const SMALLEST_DETERMINANT: f32 = 0.1;
 
 /// Grey levels between which the frame shows the brightness of a point. At the limits of the sensor's range, to
-/// rounding, the point is at least as bright or as dark.
-pub(crate) const UNCLIPPED_GREY: [f32; 2] = [0.5, 254.5];
+/// rounding, the point is at least as bright or as dark. Black is 1: 0 is [`NO_DATA`](crate::slam::image::NO_DATA).
+pub(crate) const UNCLIPPED_GREY: [f32; 2] = [1.5, 254.5];
 
 /// One state on one level, in the form needed by the loop over points.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -127,11 +127,11 @@ pub struct PointTerms {
     pub jacobian: [f32; UNKNOWNS],
 }
 
-/// The terms of one point; `None` if it is out of view.
+/// The terms of one point; `None` if it is out of view, or where the image has no data.
 #[inline(always)]
 pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option<PointTerms> {
     let [u, v] = projection(at, point)?;
-    let value = sample(image, u, v) * at.grey_per_sum;
+    let value = sample(image, u, v)? * at.grey_per_sum;
     let Surface { a: [ax, ay], n: [nx, ny], inverse_ratio } = Surface::of(at, point);
     let m = ax * nx + ay * ny;
     let along = |[x, y, z]: [f32; 3]| -> f32 { (ax * x + ay * y - m * z) * inverse_ratio };
@@ -180,9 +180,9 @@ fn projection(at: &Evaluation, point: &Point) -> Option<[f32; 2]> {
     inside.then_some([u, v])
 }
 
-/// Bilinear sample of the image.
+/// Bilinear sample of the image; `None` if it includes a pixel without data.
 #[inline(always)]
-fn sample(image: &Image<u16>, u: f32, v: f32) -> f32 {
+fn sample(image: &Image<u16>, u: f32, v: f32) -> Option<f32> {
     let (column, row) = (u as usize, v as usize);
     let (du, dv) = (u - column as f32, v - row as f32);
     let upper = column + row * image.width();
@@ -190,7 +190,7 @@ fn sample(image: &Image<u16>, u: f32, v: f32) -> f32 {
     let (p00, p10) = (pixel(upper), pixel(upper + 1));
     let (p01, p11) = (pixel(upper + image.width()), pixel(upper + image.width() + 1));
     let (above, below) = (p00 + (p10 - p00) * du, p01 + (p11 - p01) * du);
-    above + (below - above) * dv
+    (p00 * p10 * (p01 * p11) > 0.0).then_some(above + (below - above) * dv)
 }
 
 /// The surface around a point as seen in the frame, at the depth of its surroundings.

@@ -97,7 +97,7 @@ impl Plane {
             for u in 0..at.width {
                 let grey = self.grey(at, keyframe_from_camera, u as f64, v as f64);
                 let noisy = gain * grey + offset + noise_std_dev * noise.normal();
-                pixels.push(noisy.round().clamp(0.0, 255.0) as u8);
+                pixels.push(noisy.round().clamp(1.0, 255.0) as u8);
             }
         }
         pixels

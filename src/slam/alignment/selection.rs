@@ -101,10 +101,13 @@ impl Selection {
             let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
             let row = v * width;
             let at = |index: usize| f32::from(pixels[index]);
-            let gx = (at(row + (u + 1).min(right)) - at(row + u.saturating_sub(1))) * grey;
+            let beside = [at(row + u.saturating_sub(1)), at(row + (u + 1).min(right))];
             let below = if v < bottom { row + width } else { row };
-            let gy = (at(below + u) - at(row.saturating_sub(width) + u)) * grey;
-            let squared_gradient = gx * gx + gy * gy;
+            let across = [at(row.saturating_sub(width) + u), at(below + u)];
+            let [gx, gy] = [beside, across].map(|[before, after]| (after - before) * grey);
+            // Next to pixels without data there is no gradient.
+            let has_data = beside[0] * beside[1] * (across[0] * across[1]) > 0.0;
+            let squared_gradient = if has_data { gx * gx + gy * gy } else { 0.0 };
             let score =
                 squared_gradient / (noise + squared_gradient * from_depth * candidate.variance);
             let tile = (v / TILE_PX) * columns + u / TILE_PX;

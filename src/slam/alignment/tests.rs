@@ -15,17 +15,17 @@ use crate::slam::kernel::{Kernel, SimdMode};
 use crate::slam::keyframe::Keyframe;
 use crate::slam::pose::Brightness;
 
-const LEVELS: usize = 4;
-const LEVEL: usize = 1;
+pub(super) const LEVELS: usize = 4;
+pub(super) const LEVEL: usize = 1;
 
-fn pyramid(pixels: &[u8]) -> SumPyramid {
+pub(super) fn pyramid(pixels: &[u8]) -> SumPyramid {
     let camera = small_camera();
     let mut pyramid = SumPyramid::with_size(camera.width, camera.height, LEVELS, LEVEL);
     pyramid.fill(pixels);
     pyramid
 }
 
-fn evaluation(pose: &SE3, brightness: Brightness) -> Evaluation {
+pub(super) fn evaluation(pose: &SE3, brightness: Brightness) -> Evaluation {
     evaluation_with(&AlignmentParams::default(), pose, brightness)
 }
 
@@ -34,7 +34,7 @@ fn evaluation_with(params: &AlignmentParams, pose: &SE3, brightness: Brightness)
     Evaluation::new(&camera, LEVEL, pose, brightness, params, translation)
 }
 
-fn move_of(seed: u64, size: f64) -> SE3 {
+pub(super) fn move_of(seed: u64, size: f64) -> SE3 {
     let mut noise = Noise(seed);
     SE3::exp(&Vector6::from_fn(|_, _| size * noise.uniform()))
 }
@@ -227,7 +227,7 @@ fn pixels_that_the_sensor_clips_are_not_compared() {
     // A third of the pixels is white in one frame, black in the other; everything is as predicted.
     for (gain, offset) in [(1.6f64, 0.0), (1.6, -160.0)] {
         let frame = plane.render(&camera, &pose, 1.0, (gain, offset), 8);
-        let clipped = frame.iter().filter(|grey| [0, 255].contains(*grey)).count();
+        let clipped = frame.iter().filter(|grey| [1, 255].contains(*grey)).count();
         assert!((frame.len() / 10..frame.len() / 2).contains(&clipped), "{clipped}");
         let pyramid = pyramid(&frame);
         let image = pyramid.level(LEVEL);
@@ -465,7 +465,7 @@ fn correlated_residuals_increase_the_covariance() {
     let patches: Vec<_> = (0..20 * 15).map(|_| 4.0 * noise.normal()).collect();
     let deviating = clean.iter().enumerate().map(|(i, &grey)| {
         let (u, v) = (i % camera.width, i / camera.width);
-        (f64::from(grey) + patches[v / 16 * 20 + u / 16]).round().clamp(0.0, 255.0) as u8
+        (f64::from(grey) + patches[v / 16 * 20 + u / 16]).round().clamp(1.0, 255.0) as u8
     });
     let (clean, deviating) =
         (std_dev(&pyramid(&clean)), std_dev(&pyramid(&deviating.collect::<Vec<_>>())));

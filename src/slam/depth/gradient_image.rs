@@ -2,6 +2,7 @@
 
 use rayon::prelude::*;
 
+use crate::slam::image::NO_DATA;
 use crate::slam::image::buffer::Image;
 
 /// Pixels nearer to the border than this carry no depth: the matching pattern reaches 2 pixels, its
@@ -11,8 +12,12 @@ pub const BORDER_PX: usize = 4;
 /// Least number of rows per thread where a row is cheap: waking another thread costs as much as thousands of pixels.
 pub(super) const BAND_ROWS: usize = 60;
 
+/// Pixels nearer than this, in columns and rows, to one without data have no gradient: the matching pattern and its
+/// gradients would include it.
+const NO_DATA_REACH_PX: usize = 3;
+
 /// Grey level of a pixel that may be underexposed.
-const BLACK: u8 = 0;
+const BLACK: u8 = 1;
 /// Grey level of a pixel that may be overexposed.
 const WHITE: u8 = 255;
 
@@ -32,7 +37,8 @@ impl GradientImage {
         Self { intensity: Image::filled(width, height, 0), differences: [flat.clone(), flat] }
     }
 
-    /// Copies the grey values of a frame of the same size and differentiates them.
+    /// Copies the grey values of a frame of the same size and differentiates them. Next to pixels without data all
+    /// differences are 0.
     pub fn fill(&mut self, pixels: &[u8]) {
         let (width, height) = (self.width(), self.height());
         let row = |v: usize| &pixels[v * width..(v + 1) * width];
@@ -50,6 +56,29 @@ impl GradientImage {
                 *out = i16::from(below) - i16::from(above);
             }
         });
+        if pixels.contains(&NO_DATA) {
+            self.level_beside_missing();
+        }
+    }
+
+    /// Sets the differences of the pixels that are next to one without data to 0.
+    fn level_beside_missing(&mut self) {
+        const REACH: usize = NO_DATA_REACH_PX;
+        let (width, height) = (self.width(), self.height());
+        let mut least = vec![0; width];
+        for v in 0..height {
+            least.fill(u8::MAX);
+            for row in v.saturating_sub(REACH)..(v + REACH + 1).min(height) {
+                let row = self.intensity.row(row).iter();
+                least.iter_mut().zip(row).for_each(|(least, grey)| *least = *grey.min(least));
+            }
+            for u in 0..width {
+                let around = &least[u.saturating_sub(REACH)..(u + REACH + 1).min(width)];
+                if around.contains(&NO_DATA) {
+                    self.differences.iter_mut().for_each(|of| of.pixels_mut()[v * width + u] = 0);
+                }
+            }
+        }
     }
 
     /// (∂I/∂u, ∂I/∂v) at this index of the image by central difference, grey levels per pixel; 0 on the border.
@@ -121,8 +150,28 @@ mod tests {
         assert_eq!(image.gradient(8 * width + 7), (5.0, 3.0));
         assert_eq!(image.gradient(8 * width), (0.0, 0.0));
         let step: Vec<u8> =
-            (0..width * height).map(|i| if i % width < 8 { 255 } else { 0 }).collect();
+            (0..width * height).map(|i| if i % width < 8 { 255 } else { BLACK }).collect();
         image.fill(&step);
-        assert_eq!(image.gradient(8 * width + 7), (-127.5, 0.0));
+        assert_eq!(image.gradient(8 * width + 7), (-127.0, 0.0));
+    }
+
+    #[test]
+    fn next_to_pixels_without_data_there_is_no_gradient() {
+        let (width, height) = (40, 30);
+        let mut pixels: Vec<u8> = (0..width * height).map(|i| (i % width * 5 + 1) as u8).collect();
+        pixels[15 * width + 20] = NO_DATA;
+        let mut image = GradientImage::with_size(width, height);
+        image.fill(&pixels);
+        for v in 1..height - 1 {
+            for u in 1..width - 1 {
+                let is_near =
+                    u.abs_diff(20) <= NO_DATA_REACH_PX && v.abs_diff(15) <= NO_DATA_REACH_PX;
+                let expected = if is_near { (0.0, 0.0) } else { (5.0, 0.0) };
+                assert_eq!(image.gradient(v * width + u), expected, "{u}, {v}");
+            }
+        }
+        pixels[15 * width + 20] = 101;
+        image.fill(&pixels);
+        assert_eq!(image.gradient(15 * width + 21), (5.0, 0.0), "nothing remains in used memory");
     }
 }

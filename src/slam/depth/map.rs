@@ -231,7 +231,7 @@ mod tests {
         assert!(candidates(&stripes(200)) > 50);
         assert_eq!(candidates(&stripes(255)), 0);
         let mut dark = stripes(200);
-        dark[8 * width + 10] = 0;
+        dark[8 * width + 10] = 1;
         assert_eq!(candidates(&stripes(200)) - candidates(&dark), 5);
     }
 

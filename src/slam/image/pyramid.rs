@@ -1,5 +1,7 @@
-//! The image pyramid: level l+1 is the 2×2 mean of level l; sizes halve, rounding down.
+//! The image pyramid: level l+1 is the 2×2 mean of level l; sizes halve, rounding down. Pixels without data are NaN, and
+//! with them every mean and every sample that includes one.
 
+use crate::slam::image::NO_DATA;
 use crate::slam::image::buffer::Image;
 
 /// Grey levels of one frame as f32, finest first.
@@ -23,7 +25,7 @@ impl Pyramid {
             return;
         }
         for (out, &grey) in base.pixels_mut().iter_mut().zip(pixels) {
-            *out = f32::from(grey);
+            *out = value(grey);
         }
         for level in 1..self.levels.len() {
             let (fine, coarse) = self.levels.split_at_mut(level);
@@ -37,6 +39,11 @@ impl Pyramid {
     }
 }
 
+/// The value of a pixel of level 0.
+pub(crate) fn value(grey: u8) -> f32 {
+    if grey == NO_DATA { f32::NAN } else { f32::from(grey) }
+}
+
 /// 2×2 mean.
 fn halve(fine: &Image<f32>, coarse: &mut Image<f32>) {
     let width = coarse.width();
@@ -44,6 +51,23 @@ fn halve(fine: &Image<f32>, coarse: &mut Image<f32>) {
         let (upper, lower) = (fine.row(2 * v), fine.row(2 * v + 1));
         for (u, out) in row.iter_mut().enumerate() {
             *out = 0.25 * (upper[2 * u] + upper[2 * u + 1] + lower[2 * u] + lower[2 * u + 1]);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_without_data_and_their_means_are_nan() {
+        let mut pixels = vec![8; 8 * 8];
+        pixels[3 * 8 + 2] = NO_DATA;
+        let mut pyramid = Pyramid::with_size(8, 8, 3);
+        pyramid.fill(&pixels);
+        for (level, image) in pyramid.levels().iter().enumerate() {
+            let missing = image.pixels().iter().filter(|value| value.is_nan()).count();
+            assert_eq!((missing, image.at(2 >> level, 3 >> level).is_nan()), (1, true), "{level}");
         }
     }
 }

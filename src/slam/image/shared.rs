@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use crate::slam::image::NO_DATA;
+
 /// A row-major image of grey values, `width * height` bytes. Clones share the pixels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SharedImage {
@@ -37,7 +39,7 @@ impl SharedImage {
         &self.pixels[v * self.width..(v + 1) * self.width]
     }
 
-    /// 2×2 means, rounded: half a grey level is far below the noise.
+    /// 2×2 means, rounded: half a grey level is far below the noise. No data where any of the four has none.
     pub fn halved(&self) -> Self {
         let (width, height) = (self.width / 2, self.height / 2);
         let mut pixels = vec![0; width * height];
@@ -46,7 +48,8 @@ impl SharedImage {
             let pairs = upper.as_chunks::<2>().0.iter().zip(lower.as_chunks::<2>().0);
             for (mean, (&upper, &lower)) in row.iter_mut().zip(pairs) {
                 let [[a, b], [c, d]] = [upper, lower].map(|pair| pair.map(u16::from));
-                *mean = ((a + b + c + d + 2) / 4) as u8;
+                let rounded = ((a + b + c + d + 2) / 4) as u8;
+                *mean = if a.min(b).min(c.min(d)) == 0 { NO_DATA } else { rounded };
             }
         }
         Self { width, height, pixels: pixels.into() }
@@ -63,5 +66,11 @@ mod tests {
             SharedImage::try_from_pixels(5, 2, [1, 2, 255, 254, 9, 3, 4, 255, 255, 9].into());
         assert_eq!(image.unwrap().halved().pixels(), [3, 255]);
         assert!(SharedImage::try_from_pixels(5, 3, [0; 10].into()).is_none());
+    }
+
+    #[test]
+    fn a_mean_that_includes_a_pixel_without_data_has_none() {
+        let image = SharedImage::try_from_pixels(4, 2, [200, 200, 1, 1, 200, NO_DATA, 1, 1].into());
+        assert_eq!(image.unwrap().halved().pixels(), [NO_DATA, 1]);
     }
 }

@@ -1,7 +1,8 @@
 //! The pyramid that alignment reads: each pixel of level l is the **sum** of the 4ˡ level-0 pixels that it covers.
 //!
 //! Sums of bytes are exact in 16 bits up to level 4: no level is rounded, two neighbours fit one 32-bit load, and the
-//! memory traffic is half that of f32. A sum times [`grey_per_sum`] is the 2×2 mean of means of the notation.
+//! memory traffic is half that of f32. A sum times [`grey_per_sum`] is the 2×2 mean of means of the notation. It is 0,
+//! no data, where any of the pixels has none.
 
 use crate::slam::image::buffer::Image;
 
@@ -73,13 +74,13 @@ impl SumPyramid {
         &self.levels[level]
     }
 
-    /// Standard deviation of the coarsest level, grey levels: noise averages out there.
+    /// Standard deviation of the coarsest level's pixels with data, grey levels: noise averages out there.
     pub fn contrast(&self) -> f64 {
         let Some(coarsest) = self.levels.last() else { return 0.0 };
-        let pixels = coarsest.pixels();
-        let count = pixels.len().max(1) as f64;
-        let mean = pixels.iter().map(|&sum| f64::from(sum)).sum::<f64>() / count;
-        let squared = pixels.iter().map(|&sum| (f64::from(sum) - mean).powi(2)).sum::<f64>();
+        let sums = coarsest.pixels().iter().filter(|&&sum| sum > 0).map(|&sum| f64::from(sum));
+        let count = sums.clone().count().max(1) as f64;
+        let mean = sums.clone().sum::<f64>() / count;
+        let squared = sums.map(|sum| (sum - mean).powi(2)).sum::<f64>();
         (squared / count).sqrt() * f64::from(grey_per_sum(self.levels.len() - 1))
     }
 
@@ -94,7 +95,7 @@ impl SumPyramid {
     }
 }
 
-/// Sums of 2×2 numbers in rows of `width`.
+/// Sums of 2×2 numbers in rows of `width`; 0 where any of them is.
 fn halve<T: Copy + Into<u16>>(fine: &[T], width: usize, coarse: &mut Image<u16>) {
     let coarse_width = coarse.width();
     if coarse_width == 0 {
@@ -107,7 +108,8 @@ fn halve<T: Copy + Into<u16>>(fine: &[T], width: usize, coarse: &mut Image<u16>)
         for (out, (&up, &low)) in out.iter_mut().zip(pairs) {
             let [[a, b], [c, d]] = [up, low].map(|pair| pair.map(Into::into));
             // Cannot overflow (MAX_LEVELS); wrapping spares the check.
-            *out = a.wrapping_add(b).wrapping_add(c.wrapping_add(d));
+            let sum = a.wrapping_add(b).wrapping_add(c.wrapping_add(d));
+            *out = if a.min(b).min(c.min(d)) == 0 { 0 } else { sum };
         }
     }
 }
@@ -115,11 +117,12 @@ fn halve<T: Copy + Into<u16>>(fine: &[T], width: usize, coarse: &mut Image<u16>)
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::slam::image::NO_DATA;
 
     #[test]
     fn every_level_is_the_exact_sum_even_for_odd_sizes() {
         let (width, height) = (77, 53);
-        let pixels: Vec<u8> = (0..width * height).map(|i| ((i * 7919) % 256) as u8).collect();
+        let pixels: Vec<u8> = (0..width * height).map(|i| (1 + i * 7919 % 255) as u8).collect();
         for finest in 0..2 {
             let mut pyramid = SumPyramid::with_size(width, height, 4, finest);
             pyramid.fill(&pixels);
@@ -154,5 +157,19 @@ mod tests {
         let mut pyramid = SumPyramid::with_size(32, 32, 3, 0);
         pyramid.fill(&[9; 31 * 32]);
         assert_eq!(pyramid.level(2).at(1, 1), 0);
+    }
+
+    #[test]
+    fn a_sum_that_includes_a_pixel_without_data_has_none_and_is_left_out_of_the_contrast() {
+        let mut pixels = vec![100; 32 * 32];
+        pixels[5 * 32 + 9] = NO_DATA;
+        let mut pyramid = SumPyramid::with_size(32, 32, 4, 0);
+        pyramid.fill(&pixels);
+        for level in 0..4 {
+            let image = pyramid.level(level);
+            let missing = image.pixels().iter().filter(|&&sum| sum == 0).count();
+            assert_eq!((missing, image.at(9 >> level, 5 >> level)), (1, 0), "level {level}");
+        }
+        assert_eq!(pyramid.contrast(), 0.0);
     }
 }

@@ -1,6 +1,8 @@
 //! Similarity of two images, independent of their cameras' poses: small blurred images, correlated over small shifts
 //! (Klein, Murray 2008).
 
+use crate::slam::image::NO_DATA;
+
 /// Size of the small images.
 pub(in crate::slam) const COLUMNS: usize = 32;
 pub(in crate::slam) const ROWS: usize = 24;
@@ -20,7 +22,7 @@ pub struct Appearance {
 }
 
 impl Appearance {
-    /// Computes the appearance of a row-major image; `None` where it is too small or `pixels` does not match its size.
+    /// Computes the appearance of a row-major image, with the mean grey where it has no data; `None` where it is too small or `pixels` does not match its size.
     pub fn of(pixels: &[u8], width: usize, height: usize) -> Option<Self> {
         if width < COLUMNS || height < ROWS || pixels.len() != width * height {
             return None;
@@ -31,11 +33,15 @@ impl Appearance {
             for column in 0..COLUMNS {
                 let columns = column * width / COLUMNS..(column + 1) * width / COLUMNS;
                 let lines = rows.clone().map(|v| &pixels[v * width..][columns.clone()]);
-                let sum: u32 = lines.flatten().map(|&grey| u32::from(grey)).sum();
-                greys.push(sum as f32 / (rows.len() * columns.len()) as f32);
+                let [mut sum, mut count] = [0u32; 2];
+                for &grey in lines.flatten() {
+                    sum += u32::from(grey);
+                    count += u32::from(grey != NO_DATA);
+                }
+                greys.push((count > 0).then(|| sum as f32 / count as f32));
             }
         }
-        Some(Self::with(blurred(&greys)))
+        Some(Self::with(blurred(&completed(greys))))
     }
 
     fn with(greys: Vec<f32>) -> Self {
@@ -50,10 +56,7 @@ impl Appearance {
     /// shows. Where it is none of them, the mean grey lowers the similarity to anything.
     pub(in crate::slam) fn resampled(&self, seen_at: impl Fn(usize) -> usize) -> Self {
         let grey = |pixel| self.greys.get(seen_at(pixel)).copied();
-        let greys: Vec<Option<f32>> = (0..COLUMNS * ROWS).map(grey).collect();
-        let count = greys.iter().flatten().count().max(1);
-        let mean = greys.iter().flatten().sum::<f32>() / count as f32;
-        Self::with(greys.into_iter().map(|grey| grey.unwrap_or(mean)).collect())
+        Self::with(completed((0..COLUMNS * ROWS).map(grey).collect()))
     }
 
     /// Fine detail, row-major: light and large surfaces are removed, so that it tells apart views that share little.
@@ -77,6 +80,13 @@ impl Appearance {
         let rows = self.greys[COLUMNS * y..].chunks_exact(COLUMNS).take(INNER[1]);
         rows.map(move |row| &row[x..x + INNER[0]])
     }
+}
+
+/// The mean grey in place of what is missing.
+fn completed(greys: Vec<Option<f32>>) -> Vec<f32> {
+    let count = greys.iter().flatten().count().max(1);
+    let mean = greys.iter().flatten().sum::<f32>() / count as f32;
+    greys.into_iter().map(|grey| grey.unwrap_or(mean)).collect()
 }
 
 /// Blurs with the weights (1, 2, 1) / 4 along rows and along columns.
@@ -142,5 +152,22 @@ mod tests {
         assert_eq!(wall.similarity(&wall), -1.0);
         assert_eq!(Appearance::of(&[0; 20 * 80], 20, 80), None);
         assert_eq!(Appearance::of(&[0; 99], 100, 80), None);
+    }
+
+    #[test]
+    fn what_a_mask_hides_makes_no_views_similar() {
+        let hide = |mut image: Vec<u8>| {
+            let half = image.len() / 2;
+            image[half..].fill(NO_DATA);
+            Appearance::of(&image, CAMERA.width, CAMERA.height).unwrap()
+        };
+        let view = |twist: [f64; 6], seed| {
+            Scene::new(3).render(&CAMERA, &SE3::exp(&Vector6::from(twist))).noisy(2.0, seed)
+        };
+        let here = hide(view([0.0; 6], 1));
+        let turned = hide(view([0.0, 0.0, 0.0, 0.0, 0.06, 0.0], 2));
+        let elsewhere = hide(view([0.0, 0.0, 0.0, 0.0, 1.5, 0.0], 3));
+        assert!(here.similarity(&turned) > 0.8, "{}", here.similarity(&turned));
+        assert!(here.similarity(&elsewhere) < 0.7, "{}", here.similarity(&elsewhere));
     }
 }

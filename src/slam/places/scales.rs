@@ -1,5 +1,7 @@
 //! An image at several scales, and the same blurred.
 
+use crate::slam::image::NO_DATA;
+
 /// Ratio of successive scales.
 pub(super) const SCALE_STEP: f32 = 1.25;
 
@@ -55,7 +57,7 @@ pub(super) const MAX_SCALES: usize = 7;
 /// Shorter side of the smallest: two descriptors side by side.
 const SMALLEST_PX: usize = 72;
 
-/// Resamples bilinearly.
+/// Resamples bilinearly; no data where any of the four pixels has none.
 fn resample(
     from: &[u8],
     [width, height]: [usize; 2],
@@ -84,13 +86,16 @@ fn resample(
         let (above, below) = (&from[begin..begin + width], &from[begin + width..begin + 2 * width]);
         let (upper, lower) = (upper as u16, lower as u16);
         for ((mixed, above), below) in mixed.iter_mut().zip(above).zip(below) {
+            let has_data = *above.min(below) != NO_DATA;
             // At most 255 × 256.
-            *mixed = upper * u16::from(*above) + lower * u16::from(*below);
+            let sum = upper * u16::from(*above) + lower * u16::from(*below);
+            *mixed = if has_data { sum } else { 0 };
         }
         to.extend(across.iter().map(|&[column, left, right]| {
             let at = column as usize;
+            let has_data = mixed[at].min(mixed[at + 1]) > 0;
             let sum = left * u32::from(mixed[at]) + right * u32::from(mixed[at + 1]);
-            ((sum + ONE * ONE / 2) / (ONE * ONE)) as u8
+            if has_data { ((sum + ONE * ONE / 2) / (ONE * ONE)) as u8 } else { NO_DATA }
         }));
     }
 }
@@ -126,4 +131,20 @@ fn blur(from: &[u8], width: usize, scratch: &mut Vec<u16>, to: &mut Vec<u8>) {
 #[inline(always)]
 fn weighted([a, b, c, d, e, f, g]: [u16; 7]) -> u16 {
     18 * (a + g) + 33 * (b + f) + 49 * (c + e) + 56 * d
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_resampled_pixel_that_includes_one_without_data_has_none() {
+        let mut pixels = vec![1; 100 * 80];
+        pixels[40 * 100 + 50] = NO_DATA;
+        let mut smaller = Vec::new();
+        resample(&pixels, [100, 80], &mut smaller, [80, 64]);
+        let missing = smaller.iter().filter(|&&grey| grey == NO_DATA).count();
+        assert!((1..=4).contains(&missing), "{missing}");
+        assert!(smaller.iter().all(|grey| [NO_DATA, 1].contains(grey)), "black is kept");
+    }
 }

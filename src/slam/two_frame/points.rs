@@ -20,7 +20,7 @@ pub struct PatchBlock {
     pub v: Lanes,
     /// Brightness at the samples of the pattern.
     pub intensities: [Lanes; 8],
-    /// Weights of the samples; all 0 where the patch does not fit into the level.
+    /// Weights of the samples; all 0 where the patch does not fit into the level, or includes pixels without data.
     pub weights: [Lanes; 8],
     /// Sum of a point's weights.
     pub weight: Lanes,
@@ -110,13 +110,19 @@ fn fill_lane(
     if !columns.contains(&u) || !rows.contains(&v) {
         return;
     }
-    for (k, (x, y)) in PATTERN.iter().enumerate() {
-        let (x, y) = (u + *x as f32, v + *y as f32);
+    let samples = PATTERN.map(|(x, y)| {
+        let (x, y) = (u + x as f32, v + y as f32);
         let gu = 0.5 * (image.bilinear(x + 1.0, y) - image.bilinear(x - 1.0, y));
         let gv = 0.5 * (image.bilinear(x, y + 1.0) - image.bilinear(x, y - 1.0));
-        block.intensities[k][l] = image.bilinear(x, y);
-        block.weights[k][l] = sample_weight(gu, gv);
-        block.weight[l] += block.weights[k][l];
+        (image.bilinear(x, y), sample_weight(gu, gv))
+    });
+    if samples.iter().any(|(intensity, weight)| intensity.is_nan() || weight.is_nan()) {
+        return;
+    }
+    for (k, (intensity, weight)) in samples.into_iter().enumerate() {
+        block.intensities[k][l] = intensity;
+        block.weights[k][l] = weight;
+        block.weight[l] += weight;
     }
 }
 

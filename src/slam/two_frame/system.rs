@@ -294,6 +294,10 @@ impl PatternSums {
             }
             let c = lanes(|l| gain[l] * patch.intensities[k][l]);
             let [brightness, gu, gv] = sampler.sample(image, &u, &v);
+            for l in 0..LANES {
+                // NaN: no data.
+                sums.visible[l] &= (brightness[l] >= 0.0) & (gu[l] + gv[l] > f32::NEG_INFINITY);
+            }
             let r = lanes(|l| brightness[l] - (c[l] + geometry.offset));
             sums.add_sample(&r, [&gu, &gv], &c, &patch.weights[k]);
         }

@@ -262,6 +262,20 @@ const IMAGES: &[Row] = &[
         1,
         &["none of its 20 images", "320x240"],
     ),
+    row(
+        "a mask of another size than the camera's images",
+        "cp $(image 1) mask.png && echo '100 100 50 50 320 240' > recording/camera.txt",
+        "semidense run recording --mask mask.png",
+        1,
+        &["mask.png", "160x120", "320x240", "draw it over one of them"],
+    ),
+    row(
+        "a mask that does not exist",
+        "",
+        "semidense replay recording --mask mask.png",
+        1,
+        &["mask.png", "cannot be read"],
+    ),
 ];
 
 const LISTS: &[Row] = &[

@@ -10,7 +10,7 @@ use crate::slam::alignment::residual::{
     BORDER_PX, Evaluation, NEAREST_DEPTH_RATIO, SMALLEST_DETERMINANT, UNCLIPPED_GREY,
 };
 use crate::slam::image::buffer::Image;
-use crate::slam::kernel::lanes_kernel::{Lanes, Mask, Register};
+use crate::slam::kernel::lanes_kernel::{Lanes, Mask, Register, Sample};
 use crate::slam::kernel::{Body, Floats, Instructions};
 
 /// Blocks per chunk: its columns take 10 kB, a third of a small L1 cache.
@@ -122,8 +122,10 @@ pub fn whiten<I: Instructions>(
 ) {
     let load = |column: &[f32; LANES]| lanes.load(&column[lane..]);
     let (zero, one) = (lanes.splat(0.0), lanes.splat(1.0));
-    let (u, v, in_view) = project(lanes, block, lane, at);
-    let value = sample(image, u, v) * lanes.splat(at.grey_per_sum);
+    let (u, v, in_image) = project(lanes, block, lane, at);
+    let pixels = Lanes::sample(image.pixels(), image.width(), u, v);
+    let in_view = in_image & has_data(&pixels).greater(zero);
+    let value = interpolate(&pixels) * lanes.splat(at.grey_per_sum);
     let predicted = load(&block.intensity) * lanes.splat(at.gain);
     let residual = value - (predicted + lanes.splat(at.offset));
     // At the limits of the sensor, a residual pointing beyond the limit carries no information.
@@ -205,10 +207,15 @@ fn project<I: Instructions>(
     (in_view.select(u, border), in_view.select(v, border), in_view)
 }
 
+/// Positive unless one of the four pixels has no data.
+#[inline(always)]
+fn has_data<R: Register>(pixels: &Sample<R>) -> Lanes<R> {
+    pixels.upper_left * pixels.upper_right * (pixels.lower_left * pixels.lower_right)
+}
+
 /// Bilinear sample of the image.
 #[inline(always)]
-fn sample<R: Register>(image: &Image<u16>, u: Lanes<R>, v: Lanes<R>) -> Lanes<R> {
-    let pixels = Lanes::sample(image.pixels(), image.width(), u, v);
+fn interpolate<R: Register>(pixels: &Sample<R>) -> Lanes<R> {
     let above = (pixels.upper_right - pixels.upper_left).mul_add(pixels.du, pixels.upper_left);
     let below = (pixels.lower_right - pixels.lower_left).mul_add(pixels.du, pixels.lower_left);
     (below - above).mul_add(pixels.dv, above)
