@@ -175,6 +175,10 @@ impl FrameSource for Bag {
         self.rectifier.rectified(raw)
     }
 
+    fn marks_hidden(&self) -> bool {
+        self.contents.is_own()
+    }
+
     fn num_frames(&self) -> Option<usize> {
         usize::try_from(self.contents.num_images).ok()
     }

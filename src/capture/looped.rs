@@ -63,6 +63,10 @@ impl FrameSource for Looped {
         self.inner.rectified(raw)
     }
 
+    fn marks_hidden(&self) -> bool {
+        self.inner.marks_hidden()
+    }
+
     fn num_frames(&self) -> Option<usize> {
         usize::try_from(self.num_frames).ok()
     }

@@ -35,6 +35,9 @@ impl Mask {
                     found.0, found.1
                 )));
             }
+            Err(ImageFileError::Read { source, .. }) => {
+                return Err(refused(format!("this mask cannot be read: {source}; check the path")));
+            }
             read => read?,
         }
         raw.iter_mut().for_each(|grey| *grey = if *grey < MIN_WHITE { 0 } else { u8::MAX });
@@ -47,12 +50,23 @@ impl Mask {
         let share = seen.iter().filter(|&&seen| seen > 0).count() as f64 / seen.len().max(1) as f64;
         if share < MIN_SEEN {
             return Err(refused(format!(
-                "this mask leaves {:.0} % of the image; what the camera sees of the robot is black, all else white: \
-                 is it inverted?",
+                "this mask leaves {:.0} % of the image; paint the robot black and everything else white; is \
+                 it inverted?",
                 100.0 * share
             )));
         }
         Ok(Self { seen })
+    }
+
+    /// A mask that hides these pixels of `count`.
+    #[cfg(test)]
+    pub fn hiding(hidden: std::ops::Range<usize>, count: usize) -> Self {
+        Self { seen: (0..count).map(|i| if hidden.contains(&i) { 0 } else { u8::MAX }).collect() }
+    }
+
+    /// Makes the pixels black that it hides.
+    pub fn blacken(&self, pixels: &mut [u8]) {
+        pixels.iter_mut().zip(&self.seen).for_each(|(grey, seen)| *grey &= seen);
     }
 
     /// The share of the image that it hides.

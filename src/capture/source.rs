@@ -90,6 +90,11 @@ pub trait FrameSource: Send {
         raw.to_vec()
     }
 
+    /// Whether grey level 0 of its frames marks pixels without data, as in our own recordings; otherwise it is black.
+    fn marks_hidden(&self) -> bool {
+        false
+    }
+
     /// Total number of frames, if known (recordings, simulator).
     fn num_frames(&self) -> Option<usize> {
         None

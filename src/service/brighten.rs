@@ -54,10 +54,10 @@ where
         Self { source, is_on, mask, brightening, max_factor: 1, ahead }
     }
 
-    /// Reads the source's next frame.
+    /// Reads the source's next frame; what is hidden is black, so that it does not count as light.
     fn read_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
         let stamp = self.source.next_into(pixels)?;
-        mark_hidden(self.mask.as_ref(), pixels);
+        self.mask.iter().for_each(|mask| mask.blacken(pixels));
         Ok(stamp)
     }
 
@@ -123,6 +123,10 @@ where
         self.source.rectified(raw)
     }
 
+    fn marks_hidden(&self) -> bool {
+        true
+    }
+
     fn num_frames(&self) -> Option<usize> {
         self.source.num_frames()
     }
@@ -166,6 +170,10 @@ where
         };
         if stamp.is_some() {
             self.brighten(pixels);
+            // Afterwards, so that black is not brightened.
+            if self.mask.is_some() || !self.source.marks_hidden() {
+                mark_hidden(self.mask.as_ref(), pixels);
+            }
         }
         Ok(stamp)
     }
@@ -197,6 +205,7 @@ mod tests {
     use std::os::fd::AsFd;
 
     use super::*;
+    use crate::slam::image::NO_DATA;
     use crate::slam::test_scene::CAMERA;
 
     /// Frames of one grey level each; `None` is a frame that cannot be read.
@@ -306,5 +315,19 @@ mod tests {
             assert_eq!(source.await_frame(never.as_fd(), 0).unwrap(), Arrival::Frame);
             assert_eq!(next(&mut source), Some((sequence, 120)));
         }
+    }
+
+    #[test]
+    fn what_a_mask_hides_stays_hidden_in_a_brightened_image_and_black_stays_black() {
+        let count = CAMERA.width * CAMERA.height;
+        let mut source = brightened(vec![Some(30); 10]);
+        source.mask = Some(Mask::hiding(0..count / 3, count));
+        let mut pixels = vec![0; count];
+        source.next_into(&mut pixels).unwrap();
+        assert!(pixels[..count / 3].iter().all(|&grey| grey == NO_DATA));
+        assert!(pixels[count / 3..].iter().all(|&grey| grey == 120));
+        let mut source = brightened(vec![Some(30), Some(0), Some(30)]);
+        assert_eq!(next(&mut source), Some((0, 120)));
+        assert_eq!(next(&mut source), Some((1, NO_DATA + 1)));
     }
 }

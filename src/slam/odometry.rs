@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::alignment::reference::Reference;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::image::NO_DATA;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::map::Map;
 use crate::slam::mapper::{Mapper, MapperParams, StepOutcome};
@@ -24,6 +25,9 @@ pub struct OdometryParams {
     pub tracker: TrackerParams,
     /// Tuning of depth and keyframes.
     pub mapper: MapperParams,
+    /// Whether pixels of grey level 0 show nothing of the scene, such as those of a robot's own parts, and are to be
+    /// ignored; otherwise they are black.
+    pub zero_is_hidden: bool,
 }
 
 /// Why there is no odometry for a camera.
@@ -73,6 +77,8 @@ pub struct Odometry {
     mapper: Mapper,
     /// Memory of the reference that the tracker returned.
     spare: Option<Box<Reference>>,
+    /// Pixels of a frame whose black ones were raised.
+    raised: Vec<u8>,
     estimate: Option<Estimate>,
     frames: u64,
 }
@@ -98,6 +104,7 @@ impl Odometry {
             mapper: Mapper::new(intrinsics, params.mapper.clone())?,
             params,
             spare: None,
+            raised: Vec::new(),
             estimate: None,
             frames: 0,
         })
@@ -106,9 +113,21 @@ impl Odometry {
     /// Tracks the next frame and returns its pose. Sequence and stamp must increase; a frame of another size is not
     /// tracked. Until the camera has moved sideways by some per cent of the distance of the scene there is no map, and
     /// poses are `Initializing`. Grey levels are taken as given: brighten a dim camera's frames with
-    /// [`Brightening`](crate::slam::image::brightening::Brightening) first. Pixels of grey level
-    /// [`NO_DATA`](crate::slam::image::NO_DATA), 0, are ignored: raise black ones to 1.
+    /// [`Brightening`](crate::slam::image::brightening::Brightening) first.
     pub fn push(&mut self, frame: &FrameView<'_>) -> PoseEstimate {
+        if self.params.zero_is_hidden || !frame.pixels.contains(&NO_DATA) {
+            return self.push_marked(frame);
+        }
+        let mut raised = std::mem::take(&mut self.raised);
+        raised.clear();
+        raised.extend(frame.pixels.iter().map(|&grey| grey.max(NO_DATA + 1)));
+        let pose = self.push_marked(&FrameView { pixels: &raised, ..*frame });
+        self.raised = raised;
+        pose
+    }
+
+    /// The same for a frame in which 0 marks pixels without data.
+    fn push_marked(&mut self, frame: &FrameView<'_>) -> PoseEstimate {
         let pose = self.tracker.track(frame, &mut |_| true);
         let mut outcome = self.mapper.step(frame, &pose, None, &mut || {});
         outcome.keyframe_changed |= self.mapper.finish_keyframe().keyframe_changed;

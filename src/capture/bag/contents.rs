@@ -63,6 +63,11 @@ impl Contents {
         self.channels.get(&channel).copied().filter(|kind| kind.is_image())
     }
 
+    /// Whether it is our own recording of the images.
+    pub fn is_own(&self) -> bool {
+        self.channels.values().any(|kind| *kind == Kind::FrameRecord)
+    }
+
     /// Whether a channel holds our own recording's stamps of the images.
     pub fn is_frame_record(&self, channel: u16) -> bool {
         self.channels.get(&channel) == Some(&Kind::FrameRecord)

@@ -266,6 +266,7 @@ fn a_summary_without_schemas_is_not_trusted() {
     let (_file, bag) = opened(&without_repeated_schemas(camera_bag(3)), None);
     let mut bag = bag.unwrap();
     assert_eq!((bag.num_frames(), bag.take_notice()), (Some(3), None));
+    assert!(!bag.marks_hidden(), "in another's bag 0 is black");
     assert_eq!(play(&mut bag).0, [(0, 0), (1, 1), (2, 2)]);
 }
 
@@ -285,6 +286,7 @@ fn our_own_recordings_keep_number_stamp_and_exposure() {
     let mut bag = bag.unwrap();
     // Rectified by its name: the projection counts, not the lens.
     assert_eq!(bag.intrinsics().fx, 2.0 * K[0]);
+    assert!(bag.marks_hidden());
     let mut pixels = vec![0; PIXELS];
     let mut found = Vec::new();
     while let Some(stamp) = bag.next_into(&mut pixels).unwrap() {

@@ -115,6 +115,12 @@ impl<S: Instructions> Along<'_, S> {
         gradients
     }
 
+    /// Whether the frame has no data under the patch at λ, in whole or in part.
+    #[inline(always)]
+    pub(super) fn is_hidden(&self, lambda: f32) -> bool {
+        self.frame.image.has_hidden() && self.sample_at(lambda).contains(&0.0)
+    }
+
     /// Samples of the frame under the patch.
     #[inline(always)]
     fn sample_at(&self, lambda: f32) -> [f32; 8] {

@@ -348,7 +348,13 @@ pub fn search<S: Instructions>(
     let (lambda, cost) = along.refine(&best, |_| gradients, REFINE_REACH_PX);
     let mean_squared_residual = cost / PATTERN.len() as f32;
     if !(mean_squared_residual <= conditioning.residual_limit(params)) {
-        return Err(Miss::Mismatch);
+        // What matches may be behind the mask.
+        let is_hidden = |step: usize| along.is_hidden(step as f32 - 0.5 * steps as f32);
+        let may_be_hidden = frame.image.has_hidden() && (0..=steps).any(is_hidden);
+        return Err(if may_be_hidden { Miss::OutOfView } else { Miss::Mismatch });
+    }
+    if along.is_hidden(lambda) {
+        return Err(Miss::OutOfView);
     }
     let pixel_std_dev = params.noise.pixel_std_dev;
     let noise_floor = 2.0 * pixel_std_dev * pixel_std_dev * PATTERN.len() as f32;

@@ -4,8 +4,6 @@
 //! every one of them: occlusions and wrong matches agree, and wrong poses are claimed. A factor on the grey levels gives
 //! dim images the contrast of ordinary ones; their noise grows with it, to that of an ordinary camera.
 
-use crate::slam::image::NO_DATA;
-
 /// Grey level below which 90 % of the first image lie when it is dim: a quarter of the range.
 const DIM_GREY: u8 = 64;
 /// The same of later images. A factor that changes within a run separates the views before and after it: with
@@ -44,8 +42,8 @@ pub struct Light {
 }
 
 impl Light {
-    /// The light of a row-major image with `width` columns, where it has data; `None` for an image that is too small, or
-    /// so dark that it shows nothing at any factor.
+    /// The light of a row-major image with `width` columns; `None` for an image that is too small, or so dark that it
+    /// shows nothing at any factor.
     pub fn of(pixels: &[u8], width: usize) -> Option<Self> {
         /// Below this, the largest factor does not reach [`DIM_GREY`].
         const MIN_USABLE_GREY: u8 = DIM_GREY >> MAX_DOUBLINGS;
@@ -56,7 +54,6 @@ impl Light {
                 counts[usize::from(grey)] += 1;
             }
         }
-        counts[usize::from(NO_DATA)] = 0;
         let measured: u32 = counts.iter().sum();
         let sum: u32 = (0..).zip(&counts).map(|(grey, count)| grey * count).sum();
         let mut brighter = measured / 10;
@@ -301,17 +298,5 @@ mod tests {
             brightening.apply(&mut pixels);
             assert_eq!(pixels.len(), len);
         }
-    }
-
-    #[test]
-    fn what_a_mask_hides_has_no_light() {
-        let mut image = ramp(100);
-        let half = image.len() / 2;
-        let light_of_half = Light::of(&image[..half], WIDTH);
-        image[half..].fill(200);
-        assert_ne!(Light::of(&image, WIDTH), light_of_half);
-        image[half..].fill(NO_DATA);
-        assert_eq!(Light::of(&image, WIDTH), light_of_half);
-        assert_eq!(Light::of(&[NO_DATA; 64 * 64], 64), None);
     }
 }

@@ -1,21 +1,25 @@
 //! A grey image stored so that one load fetches the four pixels of a bilinear sample.
 
+use crate::slam::image::NO_DATA;
+
 /// Grey values with their right, lower and lower-right neighbours, one `u32` per pixel.
 #[derive(Debug, Clone)]
 pub struct QuadImage {
     width: usize,
     height: usize,
     quads: Vec<u32>,
+    /// Whether there are pixels without data.
+    has_hidden: bool,
 }
 
 impl QuadImage {
     /// A black image.
     pub fn with_size(width: usize, height: usize) -> Self {
-        Self { width, height, quads: vec![0; width * height] }
+        Self { width, height, quads: vec![0; width * height], has_hidden: false }
     }
 
     /// Fills the image from the grey values of a frame; does nothing unless there are `width * height` of them (callers
-    /// check the size where the frame enters).
+    /// check the size where the frame enters). A sample that includes a pixel without data is 0.
     pub fn fill(&mut self, pixels: &[u8]) {
         let width = self.width;
         if pixels.len() != self.quads.len() {
@@ -28,6 +32,16 @@ impl QuadImage {
                 *quad = u32::from_le_bytes([u[0], u[1], l[0], l[1]]);
             }
         }
+        self.has_hidden = pixels.contains(&NO_DATA);
+        if self.has_hidden {
+            let is_whole = |quad: &u32| !quad.to_le_bytes().contains(&NO_DATA);
+            self.quads.iter_mut().filter(|quad| !is_whole(quad)).for_each(|quad| *quad = 0);
+        }
+    }
+
+    /// Whether there are pixels without data.
+    pub fn has_hidden(&self) -> bool {
+        self.has_hidden
     }
 
     /// Width in pixels.

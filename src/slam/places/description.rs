@@ -6,6 +6,7 @@ use std::cmp::Reverse;
 use super::corners::{Corner, CornerFinder};
 use super::pattern::{ORIENTATIONS, Pattern, RADIUS_PX, WORDS};
 use super::scales::{self, MAX_SCALES, Scale};
+use crate::slam::image::NO_DATA;
 
 /// Maximum number of features of an image.
 pub const MAX_FEATURES: usize = 200;
@@ -102,6 +103,9 @@ impl Describer {
             for threshold in THRESHOLDS {
                 let Scale { pixels, width, height, .. } = scale;
                 self.finder.find(pixels, *width, *height, MARGIN_PX, threshold, &mut self.corners);
+                if pixels.contains(&NO_DATA) {
+                    self.corners.retain(|corner| is_whole(scale, corner));
+                }
                 if self.corners.len() >= MIN_CORNERS * budget {
                     break;
                 }
@@ -124,6 +128,14 @@ const THRESHOLDS: [u8; 2] = [24, 8];
 const MIN_CORNERS: usize = 3;
 /// Pixels that a descriptor needs to the edge.
 const MARGIN_PX: usize = RADIUS_PX as usize + 1;
+
+/// Whether all of the pixels that describe a corner have data.
+fn is_whole(scale: &Scale, corner: &Corner) -> bool {
+    let (u, v) = (usize::from(corner.u), usize::from(corner.v));
+    let mut rows =
+        scale.pixels.chunks_exact(scale.width).skip(v - MARGIN_PX).take(2 * MARGIN_PX + 1);
+    rows.all(|row| !row[u - MARGIN_PX..=u + MARGIN_PX].contains(&NO_DATA))
+}
 
 /// Chooses the strongest corners, spread over the image.
 fn choose(corners: &mut [Corner], scale: &Scale, budget: usize, chosen: &mut Vec<Corner>) {
@@ -311,5 +323,25 @@ mod tests {
         let _small = used.describe(&pixels[..100 * 100], 100, 100);
         let again = used.describe(&pixels, CAMERA.width, CAMERA.height);
         assert_eq!(again, Describer::default().describe(&pixels, CAMERA.width, CAMERA.height));
+    }
+
+    #[test]
+    fn no_feature_includes_pixels_that_a_mask_hides() {
+        let (width, height) = (CAMERA.width, CAMERA.height);
+        let mut pixels = image();
+        let bare = described(&pixels, width, height);
+        let is_hidden = |u: usize, v: usize| v > height / 2 && u > width / 3;
+        for (i, grey) in
+            pixels.iter_mut().enumerate().filter(|(i, _)| is_hidden(i % width, i / width))
+        {
+            *grey = if i % 2 == 0 { NO_DATA } else { *grey };
+        }
+        let is_clear = |feature: &Feature| {
+            let (u, v) = (f32::from(feature.place.u), f32::from(feature.place.v));
+            u < width as f32 / 3.0 - 10.0 || v < height as f32 / 2.0 - 10.0
+        };
+        assert!(!bare.features.iter().all(is_clear));
+        let masked = described(&pixels, width, height);
+        assert!(masked.features.len() > 50 && masked.features.iter().all(is_clear));
     }
 }

@@ -97,8 +97,8 @@ impl Patterns {
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[repr(C, align(64))]
 pub struct Compared {
-    /// Robust cost, grey levels²; NaN where a sample is outside the image or behind the camera, infinite where the
-    /// observer sees something else.
+    /// Robust cost, grey levels²; NaN where a sample is outside the image, behind the camera or without data, infinite
+    /// where the observer sees something else.
     pub cost: Lane,
     /// Σ w J ∂r/∂d of the observer's pose; unchanged where poses are not wanted.
     pub observer: [Lane; POSE],

@@ -256,6 +256,32 @@ fn all_instruction_sets_give_the_same_bits() {
 }
 
 #[test]
+fn points_behind_a_mask_are_not_seen() {
+    let image = waves(0.0);
+    let appearance = appearance(&image, 100, 100);
+    let pair = Pair::new(&SE3::identity(), &CAMERA, ALL_WANTED);
+    let robustness = Robustness { huber_grey: 9.0, most_energy: 8.0 * 900.0 };
+    let mut patterns = [Patterns::NONE];
+    patterns[0].set(0, &appearance, ray(100.0, 100.0));
+    patterns[0].set(1, &appearance, ray(100.0, 100.0));
+    patterns[0].inverse_depth = [1.0; LANES];
+    // Hidden entirely, in one pixel of the pattern, and next to it.
+    for (hidden, is_seen) in [(0..CAMERA.width, false), (102..103, false), (106..107, true)] {
+        let mut pixels = image.pixels().to_vec();
+        pixels.chunks_exact_mut(CAMERA.width).for_each(|row| row[hidden.clone()].fill(0));
+        let image =
+            SharedImage::try_from_pixels(CAMERA.width, CAMERA.height, pixels.into()).unwrap();
+        for kernel in Kernel::available() {
+            let (mut seen, mut sums) = ([Compared::NONE], PairSums::default());
+            kernel.compare(&image, &pair, &patterns, &robustness, &mut seen, &mut sums);
+            assert_eq!(seen[0].cost[0].is_finite(), is_seen, "{kernel:?} {hidden:?}");
+            assert_eq!(seen[0].cost[0].is_nan(), !is_seen, "{kernel:?} {hidden:?}");
+            assert!(is_seen || sums == PairSums::default(), "{kernel:?} {hidden:?}");
+        }
+    }
+}
+
+#[test]
 fn invalid_numbers_are_outside_the_image() {
     let image = waves(0.0);
     let appearance = appearance(&image, 100, 100);

@@ -274,7 +274,7 @@ const IMAGES: &[Row] = &[
         "",
         "semidense replay recording --mask mask.png",
         1,
-        &["mask.png", "cannot be read"],
+        &["mask.png", "this mask cannot be read", "check the path"],
     ),
 ];
 

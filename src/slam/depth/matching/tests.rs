@@ -120,6 +120,31 @@ fn gain_and_offset_are_compensated() {
 }
 
 #[test]
+fn what_is_behind_a_mask_is_out_of_view() {
+    let params = MatchingParams::default();
+    let motion = SE3::exp(&Vector6::new(0.05, 0.0, 0.0, 0.0, 0.0, 0.0));
+    let keyframe = image(&render(&SE3::identity()));
+    let view = TwoView::new(&CAMERA, &motion);
+    let line = view.line(100.0, 75.0);
+    let (from, to, at) =
+        (line.project(0.4).unwrap(), line.project(1.2).unwrap(), line.project(0.8).unwrap());
+    let patch = Patch::new(&keyframe, 100, 75, 1.0, 0.0);
+    let conditioning = condition(&view, &line, &at, &structure(&patch), 1.0, &params).unwrap();
+    let attempt = |hidden: std::ops::Range<usize>| {
+        let mut pixels = render(&motion);
+        pixels.chunks_exact_mut(CAMERA.width).for_each(|row| row[hidden.clone()].fill(0));
+        let frame = quads(&pixels);
+        search(sampled(&frame), &line, &patch, &conditioning, &range(from, to), &params)
+    };
+    let truth = at.u as usize;
+    assert!((attempt(0..1).unwrap().inverse_depth - 0.8).abs() < 0.03);
+    // The match, part of its pattern, and all of the frame.
+    for hidden in [truth - 3..truth + 4, truth + 1..truth + 3, 0..CAMERA.width] {
+        assert!(matches!(attempt(hidden.clone()), Err(Miss::OutOfView)), "{hidden:?}");
+    }
+}
+
+#[test]
 fn a_segment_outside_the_image_or_too_long_is_a_miss() {
     let params = MatchingParams::default();
     let motion = SE3::exp(&Vector6::new(0.5, 0.0, 0.0, 0.0, 0.0, 0.0));
