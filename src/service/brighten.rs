@@ -171,7 +171,7 @@ where
         if stamp.is_some() {
             self.brighten(pixels);
             // Afterwards, so that black is not brightened.
-            if self.mask.is_some() || !self.source.marks_hidden() {
+            if !self.source.marks_hidden() {
                 mark_hidden(self.mask.as_ref(), pixels);
             }
         }

@@ -53,6 +53,28 @@ fn poses_and_map_equal_those_of_a_replay() {
 }
 
 #[test]
+fn zero_is_black_unless_it_is_said_to_be_hidden() {
+    let greys = [false, true].map(|zero_is_hidden| {
+        let mut source = source();
+        let camera = source.intrinsics();
+        let params = OdometryParams { zero_is_hidden, ..OdometryParams::default() };
+        let mut odometry = Odometry::new(camera, params).unwrap();
+        let mut pixels = vec![0; camera.width * camera.height];
+        while odometry.keyframes().is_empty()
+            && let Some(stamp) = source.next_into(&mut pixels).unwrap()
+        {
+            pixels[..10 * camera.width].fill(0);
+            odometry.push(&FrameView::new(&camera, stamp.sequence, stamp.capture_nanos, &pixels));
+        }
+        let image = &odometry.keyframes()[0].image;
+        assert!(image[10 * camera.width..].iter().all(|&grey| grey > 0));
+        image[..10 * camera.width].to_vec()
+    });
+    assert!(greys[0].iter().all(|&grey| grey == 1));
+    assert!(greys[1].iter().all(|&grey| grey == 0));
+}
+
+#[test]
 fn frames_continue_after_the_end() {
     let mut source = source();
     let truth = source.ground_truth().to_vec();
