@@ -70,7 +70,6 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     let mut source = open(&arguments.source, None, &SourceParams::default())?;
     let config = Config::default();
     let config = ReplayConfig {
-        mask: None,
         map: Default::default(),
         tracker: config.tracking,
         mapper: config.mapping,
@@ -79,6 +78,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
         max_frames: arguments.frames,
         strict: true,
         brighten: true,
+        mask: None,
     };
     let name = arguments.source.to_string();
     let record = replay(source.as_mut(), &name, &config, &mut |_| true)?;

@@ -7,7 +7,7 @@ use crate::capture::image_file::{ImageFileError, ImageFileReader};
 use crate::capture::source::FrameSource;
 use crate::capture::source_error::SourceError;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::image::NO_DATA;
+use crate::slam::image::raise_black;
 
 /// Grey level below which a pixel of the file is black.
 const MIN_WHITE: u8 = 128;
@@ -42,11 +42,8 @@ impl Mask {
         }
         raw.iter_mut().for_each(|grey| *grey = if *grey < MIN_WHITE { 0 } else { u8::MAX });
         // Pixels that are black only in part show some of the robot.
-        let seen: Vec<u8> = source
-            .rectified(&raw)
-            .into_iter()
-            .map(|grey| u8::from(grey == u8::MAX) * grey)
-            .collect();
+        let mut seen = source.rectified(&raw);
+        seen.iter_mut().filter(|grey| **grey < u8::MAX).for_each(|grey| *grey = 0);
         let share = seen.iter().filter(|&&seen| seen > 0).count() as f64 / seen.len().max(1) as f64;
         if share < MIN_SEEN {
             return Err(refused(format!(
@@ -64,8 +61,8 @@ impl Mask {
         Self { seen: (0..count).map(|i| if hidden.contains(&i) { 0 } else { u8::MAX }).collect() }
     }
 
-    /// Makes the pixels black that it hides.
-    pub fn blacken(&self, pixels: &mut [u8]) {
+    /// Makes the pixels that it hides black, [`NO_DATA`](crate::slam::image::NO_DATA).
+    pub fn hide(&self, pixels: &mut [u8]) {
         pixels.iter_mut().zip(&self.seen).for_each(|(grey, seen)| *grey &= seen);
     }
 
@@ -79,15 +76,8 @@ impl Mask {
 /// Marks the pixels of a frame that `mask` hides as without data, and raises black ones that show the scene above that
 /// mark.
 pub fn mark_hidden(mask: Option<&Mask>, pixels: &mut [u8]) {
-    /// Grey level of black pixels with data.
-    const BLACK: u8 = NO_DATA + 1;
-    match mask {
-        None => pixels.iter_mut().for_each(|grey| *grey = (*grey).max(BLACK)),
-        Some(Mask { seen }) => {
-            let pixels = pixels.iter_mut().zip(seen);
-            pixels.for_each(|(grey, seen)| *grey = (*grey).max(BLACK) & seen);
-        }
-    }
+    raise_black(pixels);
+    mask.iter().for_each(|mask| mask.hide(pixels));
 }
 
 #[cfg(test)]
@@ -97,6 +87,7 @@ mod tests {
     use super::*;
     use crate::capture::image_file::write_gray_png;
     use crate::capture::tum;
+    use crate::slam::image::NO_DATA;
 
     const SIZE: [usize; 2] = [160, 120];
 

@@ -57,7 +57,7 @@ where
     /// Reads the source's next frame; what is hidden is black, so that it does not count as light.
     fn read_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
         let stamp = self.source.next_into(pixels)?;
-        self.mask.iter().for_each(|mask| mask.blacken(pixels));
+        self.mask.iter().for_each(|mask| mask.hide(pixels));
         Ok(stamp)
     }
 

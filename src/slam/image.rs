@@ -13,5 +13,13 @@ pub mod quads_kernel;
 pub mod shared;
 pub mod sums;
 
-/// Grey level of pixels that show nothing of the scene. Black ones that do are 1.
+/// Grey level of pixels that show nothing of the scene.
 pub const NO_DATA: u8 = 0;
+
+/// Grey level of black pixels that show it.
+pub const BLACK: u8 = 1;
+
+/// Raises the pixels of an image in which 0 is black.
+pub fn raise_black(pixels: &mut [u8]) {
+    pixels.iter_mut().for_each(|grey| *grey = (*grey).max(BLACK));
+}

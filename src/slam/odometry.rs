@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::alignment::reference::Reference;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::image::NO_DATA;
+use crate::slam::image::{NO_DATA, raise_black};
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::map::Map;
 use crate::slam::mapper::{Mapper, MapperParams, StepOutcome};
@@ -120,7 +120,8 @@ impl Odometry {
         }
         let mut raised = std::mem::take(&mut self.raised);
         raised.clear();
-        raised.extend(frame.pixels.iter().map(|&grey| grey.max(NO_DATA + 1)));
+        raised.extend_from_slice(frame.pixels);
+        raise_black(&mut raised);
         let pose = self.push_marked(&FrameView { pixels: &raised, ..*frame });
         self.raised = raised;
         pose

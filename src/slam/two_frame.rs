@@ -477,4 +477,6 @@ mod brightness_tests;
 #[cfg(test)]
 mod fast_tests;
 #[cfg(test)]
+mod hidden_tests;
+#[cfg(test)]
 mod tests;

@@ -5,6 +5,7 @@ use semidense::capture::simulator::params::{MotionKind, MotionParams, SimulatorP
 use semidense::capture::source::{FrameSource, FrameStamp};
 use semidense::capture::source_error::SourceError;
 use semidense::service::replay::{ReplayConfig, replay};
+use semidense::service::results::record::RunRecord;
 use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
 use semidense::slam::evaluation::{MAX_DIFFERENCE_NANOS, evaluate_trajectory};
 use semidense::slam::geometry::intrinsics::Intrinsics;
@@ -34,12 +35,7 @@ impl<S: FrameSource> FrameSource for Dimmed<S> {
 }
 
 /// Frames tracked, and their ATE as a share of the path.
-fn dimly_lit(brighten: bool) -> (usize, Option<f64>) {
-    let motion = MotionParams { kind: MotionKind::Handheld, ..MotionParams::default() };
-    let params = SimulatorParams { frames: 150, motion, ..SimulatorParams::half_size() };
-    let mut source = Dimmed(Simulator::new(params).unwrap());
-    let config = ReplayConfig { brighten, ..ReplayConfig::default() };
-    let record = replay(&mut source, "dim", &config, &mut |_| true).unwrap();
+pub fn tracked_and_error(record: &RunRecord) -> (usize, Option<f64>) {
     let estimates = record.poses.iter().map(|pose| &pose.estimate);
     let tracked: Vec<StampedPose> = estimates
         .filter(|e| e.state.is_tracked())
@@ -49,6 +45,16 @@ fn dimly_lit(brighten: bool) -> (usize, Option<f64>) {
     let found =
         evaluate_trajectory(&tracked, truth, TrajectoryAlignment::Sim3, MAX_DIFFERENCE_NANOS);
     (tracked.len(), found.ok().map(|found| found.ate.rmse / found.path_length))
+}
+
+/// What is tracked of a room in dim light.
+fn dimly_lit(brighten: bool) -> (usize, Option<f64>) {
+    let motion = MotionParams { kind: MotionKind::Handheld, ..MotionParams::default() };
+    let params = SimulatorParams { frames: 150, motion, ..SimulatorParams::half_size() };
+    let mut source = Dimmed(Simulator::new(params).unwrap());
+    let config = ReplayConfig { brighten, ..ReplayConfig::default() };
+    let record = replay(&mut source, "dim", &config, &mut |_| true).unwrap();
+    tracked_and_error(&record)
 }
 
 #[test]

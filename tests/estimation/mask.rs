@@ -8,11 +8,11 @@ use semidense::capture::source::{FrameSource, FrameStamp};
 use semidense::capture::source_error::SourceError;
 use semidense::service::replay::{ReplayConfig, replay};
 use semidense::service::results::record::RunRecord;
-use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
-use semidense::slam::evaluation::{MAX_DIFFERENCE_NANOS, evaluate_trajectory};
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::image::NO_DATA;
 use semidense::slam::trajectory::StampedPose;
+
+use crate::dim_light::tracked_and_error;
 
 const FRAMES: u64 = 120;
 
@@ -67,26 +67,13 @@ fn replayed(with_mask: bool) -> RunRecord {
     replay(&mut source, "arm", &config, &mut |_| true).unwrap()
 }
 
-/// Frames tracked, and their ATE as a share of the path.
-fn figures(record: &RunRecord) -> (usize, Option<f64>) {
-    let estimates = record.poses.iter().map(|pose| &pose.estimate);
-    let tracked: Vec<StampedPose> = estimates
-        .filter(|e| e.state.is_tracked())
-        .map(|e| StampedPose { nanos: e.capture_nanos, world_from_camera: e.map_from_camera })
-        .collect();
-    let truth = &record.ground_truth;
-    let found =
-        evaluate_trajectory(&tracked, truth, TrajectoryAlignment::Sim3, MAX_DIFFERENCE_NANOS);
-    (tracked.len(), found.ok().map(|found| found.ate.rmse / found.path_length))
-}
-
 #[test]
 fn a_robots_arm_behind_a_mask_leaves_poses_and_depth_as_they_are() {
     let record = replayed(true);
-    let (tracked, error_ratio) = figures(&record);
+    let (tracked, error_ratio) = tracked_and_error(&record);
     println!(
         "{tracked} of {FRAMES} tracked, ATE {error_ratio:?}; bare: {:?}",
-        figures(&replayed(false))
+        tracked_and_error(&replayed(false))
     );
     assert!(tracked >= 100, "{tracked}");
     assert!(error_ratio.unwrap() < 0.003, "{error_ratio:?}");

@@ -2,8 +2,8 @@
 
 use rayon::prelude::*;
 
-use crate::slam::image::NO_DATA;
 use crate::slam::image::buffer::Image;
+use crate::slam::image::{BLACK, NO_DATA};
 
 /// Pixels nearer to the border than this carry no depth: the matching pattern reaches 2 pixels, its
 /// gradients 1, and a bilinear sample 1 more.
@@ -16,8 +16,6 @@ pub(super) const BAND_ROWS: usize = 60;
 /// gradients would include it.
 const NO_DATA_REACH_PX: usize = 3;
 
-/// Grey level of a pixel that may be underexposed.
-const BLACK: u8 = 1;
 /// Grey level of a pixel that may be overexposed.
 const WHITE: u8 = 255;
 

@@ -92,6 +92,14 @@ pub struct Sample<R> {
     pub dv: Lanes<R>,
 }
 
+impl<R: Register> Sample<R> {
+    /// Positive unless one of the pixels has no data.
+    #[inline(always)]
+    pub fn has_data(&self) -> Lanes<R> {
+        self.upper_left * self.upper_right * (self.lower_left * self.lower_right)
+    }
+}
+
 macro_rules! operators {
     ($($of:ident::$name:ident),*) => {$(
         impl<R: Register> $of for Lanes<R> {

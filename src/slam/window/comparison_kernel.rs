@@ -125,9 +125,7 @@ fn warp<I: Instructions>(
     for k in 0..SAMPLES {
         let (u, v) = positions[k];
         let at = Lanes::sample(image.pixels(), image.width(), u, v);
-        // 0 where one of the four has no data.
-        let product = at.upper_left * at.upper_right * (at.lower_left * at.lower_right);
-        inside = inside & product.greater(zero);
+        inside = inside & at.has_data().greater(zero);
         let upper = at.upper_right - at.upper_left;
         let lower = at.lower_right - at.lower_left;
         let top = at.upper_left + at.du * upper;

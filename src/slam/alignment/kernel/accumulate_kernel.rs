@@ -124,7 +124,7 @@ pub fn whiten<I: Instructions>(
     let (zero, one) = (lanes.splat(0.0), lanes.splat(1.0));
     let (u, v, in_image) = project(lanes, block, lane, at);
     let pixels = Lanes::sample(image.pixels(), image.width(), u, v);
-    let in_view = in_image & has_data(&pixels).greater(zero);
+    let in_view = in_image & pixels.has_data().greater(zero);
     let value = interpolate(&pixels) * lanes.splat(at.grey_per_sum);
     let predicted = load(&block.intensity) * lanes.splat(at.gain);
     let residual = value - (predicted + lanes.splat(at.offset));
@@ -205,12 +205,6 @@ fn project<I: Instructions>(
         |value: Floats<I>, bound| value.at_least(border) & lanes.splat(bound).greater(value);
     let in_view = in_front & inside(u, at.upper_bound[0]) & inside(v, at.upper_bound[1]);
     (in_view.select(u, border), in_view.select(v, border), in_view)
-}
-
-/// Positive unless one of the four pixels has no data.
-#[inline(always)]
-fn has_data<R: Register>(pixels: &Sample<R>) -> Lanes<R> {
-    pixels.upper_left * pixels.upper_right * (pixels.lower_left * pixels.lower_right)
 }
 
 /// Bilinear sample of the image.
