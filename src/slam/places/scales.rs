@@ -139,12 +139,14 @@ mod tests {
 
     #[test]
     fn a_resampled_pixel_that_includes_one_without_data_has_none() {
-        let mut pixels = vec![1; 100 * 80];
-        pixels[40 * 100 + 50] = NO_DATA;
-        let mut smaller = Vec::new();
-        resample(&pixels, [100, 80], &mut smaller, [80, 64]);
-        let missing = smaller.iter().filter(|&&grey| grey == NO_DATA).count();
-        assert!((1..=4).contains(&missing), "{missing}");
-        assert!(smaller.iter().all(|grey| [NO_DATA, 1].contains(grey)), "black is kept");
+        for grey in [1, 200] {
+            let mut pixels = vec![grey; 100 * 80];
+            pixels[40 * 100 + 50] = NO_DATA;
+            let mut smaller = Vec::new();
+            resample(&pixels, [100, 80], &mut smaller, [80, 64]);
+            let missing = smaller.iter().filter(|&&found| found == NO_DATA).count();
+            assert!((1..=4).contains(&missing), "{missing}");
+            assert!(smaller.iter().all(|found| [NO_DATA, grey].contains(found)), "{grey}");
+        }
     }
 }

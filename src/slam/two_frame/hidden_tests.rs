@@ -20,6 +20,7 @@ fn hidden_pixels_are_in_no_patch_and_points_behind_them_are_not_visible() {
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
     assert!(initializer.begin(&with_hidden_rows(first.clone())));
     for (level, blocks) in initializer.points.patches.iter().enumerate() {
+        assert!(blocks.iter().flat_map(|block| block.weight).all(f32::is_finite), "{level}");
         let used = blocks.iter().flat_map(|block| block.v.iter().zip(&block.weight));
         let lowest = used.filter(|(_, weight)| **weight > 0.0).map(|(v, _)| *v);
         let lowest = lowest.fold(0.0, f32::max);
