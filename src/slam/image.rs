@@ -10,6 +10,7 @@ pub mod noise;
 pub(crate) mod pyramid;
 pub mod quads;
 pub mod quads_kernel;
+pub(crate) mod repeats;
 pub mod shared;
 pub mod sums;
 

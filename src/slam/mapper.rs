@@ -216,7 +216,9 @@ impl Mapper {
     ) -> StepOutcome {
         let finished = self.finish_keyframe();
         self.start.last_frame = None;
-        self.copies.begin_frame();
+        if frame.is_consistent() {
+            self.copies.begin_frame(frame);
+        }
         let outcome = self.step_inner(&StepInput { frame, pose, sensor_depth }, change_begins);
         let is_told = self.publish_doubt();
         let keyframe_changed = outcome.keyframe_changed || finished.keyframe_changed || is_told;
@@ -277,10 +279,8 @@ impl Mapper {
     fn extend(&mut self, input: &StepInput<'_>, change_begins: &mut dyn FnMut()) -> StepOutcome {
         let StepInput { frame, pose, .. } = *input;
         self.queue_frame(frame, pose);
-        if self.copies.is_repeat(frame) {
-            // Its noise is the previous frame's: observed twice, depth would seem more certain than it is. The next
-            // frame may repeat it again.
-            self.copies.of(frame);
+        if self.copies.is_repeat() {
+            // Its noise is the previous frame's: observed twice, depth would seem more certain than it is.
             return StepOutcome::default();
         }
         self.guess_unit(&pose.keyframe_from_camera);

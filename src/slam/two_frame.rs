@@ -31,7 +31,7 @@ use crate::slam::depth::map::DepthMap;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
-use crate::slam::image::pyramid::{Pyramid, value};
+use crate::slam::image::pyramid::Pyramid;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
 use crate::slam::two_frame::covariance::{common_error, depth_variances, pose_covariance};
@@ -203,17 +203,6 @@ impl TwoFrameInitializer {
         self.waypoint = None;
         (self.frames, self.confirmed, self.mismatches) = (0, 0, 0);
         true
-    }
-
-    /// Whether `pixels` repeat the latest frame of a start, bit for bit.
-    pub(crate) fn is_latest(&self, pixels: &[u8]) -> bool {
-        let latest = self.pyramid.levels().first().map_or(&[][..], |level| level.pixels());
-        !self.first_pixels.is_empty()
-            && latest.len() == pixels.len()
-            && latest
-                .iter()
-                .zip(pixels)
-                .all(|(latest, &grey)| latest.to_bits() == value(grey).to_bits())
     }
 
     /// Takes the next frame: fits, judges, and restarts where it must.

@@ -3,6 +3,8 @@
 use std::sync::Arc;
 
 use crate::slam::frame::FrameView;
+use crate::slam::image::repeats::Repeats;
+use crate::slam::image::sums::SumPyramid;
 
 /// Most unused copies that are kept for later frames, one byte a pixel each: as many as lie between two keyframes.
 const MAX_SPARE: usize = 30;
@@ -15,27 +17,41 @@ pub(super) struct FrameCopies {
     current: Option<Arc<[u8]>>,
     /// That of the frame before it.
     previous: Option<Arc<[u8]>>,
+    repeats: Repeats,
+    pyramid: SumPyramid,
+    is_repeat: bool,
 }
 
 impl FrameCopies {
-    /// Begins a new frame.
-    pub(super) fn begin_frame(&mut self) {
+    /// Begins a new frame, which is consistent.
+    pub(super) fn begin_frame(&mut self, frame: &FrameView<'_>) {
+        self.begin_copy();
+        let (width, height) = (frame.width, frame.height);
+        if !self.pyramid.has_size(width, height, Repeats::NUM_LEVELS, 1) {
+            self.pyramid = SumPyramid::with_size(width, height, Repeats::NUM_LEVELS, 1);
+        }
+        self.pyramid.fill(frame.pixels);
+        self.is_repeat = self.repeats.observe(&self.pyramid);
+    }
+
+    /// Begins another copy.
+    pub(super) fn begin_copy(&mut self) {
         self.previous = self.current.take();
+        self.is_repeat = false;
     }
 
-    /// Whether the current frame repeats the image of the previous one, bit for bit, as frames do in a video that was
-    /// converted to a higher rate.
-    pub(super) fn is_repeat(&self, frame: &FrameView<'_>) -> bool {
-        self.previous.as_deref() == Some(frame.pixels)
+    /// Whether the current frame repeats the image of the previous one.
+    pub(super) fn is_repeat(&self) -> bool {
+        self.is_repeat
     }
 
-    /// The grey values of the current frame, copied at the first call unless they repeat the previous frame's.
+    /// The grey values of the current frame, copied at the first call; of a repeat the previous frame's.
     pub(super) fn of(&mut self, frame: &FrameView<'_>) -> Arc<[u8]> {
         if let Some(copy) = &self.current {
             return Arc::clone(copy);
         }
         let copy = match &self.previous {
-            Some(previous) if self.is_repeat(frame) => Arc::clone(previous),
+            Some(previous) if self.is_repeat => Arc::clone(previous),
             _ => self.copy(frame.pixels),
         };
         self.current = Some(Arc::clone(&copy));
@@ -73,8 +89,9 @@ mod tests {
 
     fn copy_of(copies: &mut FrameCopies, grey: u8) -> Arc<[u8]> {
         let pixels = vec![grey; CAMERA.width * CAMERA.height];
-        copies.begin_frame();
-        copies.of(&FrameView::new(&CAMERA, 0, 0, &pixels))
+        let frame = FrameView::new(&CAMERA, 0, 0, &pixels);
+        copies.begin_frame(&frame);
+        copies.of(&frame)
     }
 
     #[test]
@@ -100,7 +117,7 @@ mod tests {
         assert_eq!(copies.copies.len(), 100);
         drop(kept);
         // A frame without a copy, after which the last one's is unused as well.
-        copies.begin_frame();
+        copies.begin_copy();
         let _ = copy_of(&mut copies, 0);
         assert_eq!(copies.copies.len(), MAX_SPARE);
         let kept = copy_of(&mut copies, 7);

@@ -203,20 +203,26 @@ impl Mapper {
 
     /// Adopts the early frames for a map that has started with two frames, its first keyframes, the second at
     /// `first_from_second`. Frames before the second will be aligned to the map, from initial poses by constant motion.
-    pub(super) fn adopt_early_frames(&mut self, first_from_second: &SE3) {
+    pub(super) fn adopt_early_frames(&mut self, first_from_second: &SE3, is_second_repeat: bool) {
         let [.., first, second] = &self.map.keyframes[..] else { return };
         let motion = first_from_second.log();
         let begin = first.sequence;
         let (steps, num_repeats) = steps_of(&self.early);
+        let num_repeats = num_repeats + f64::from(is_second_repeat);
         // Of a first image that was repeated for long only the last repeats may be left.
-        let shows_first =
-            |frame: &TrackedFrame| frame.sequence == begin || frame.pixels == first.image;
+        let shows_first = |frame: &TrackedFrame| {
+            frame.sequence == begin || frame.repeats.contains(&begin) || frame.pixels == first.image
+        };
         let begin_step =
             self.early.iter().position(shows_first).map_or(begin as f64, |at| steps[at]);
         let interval = (second.sequence as f64 - num_repeats - begin_step).max(1.0);
         for (mut frame, step) in self.early.drain(..).zip(steps) {
+            frame.repeats.retain(|&sequence| sequence != begin);
             if frame.sequence == begin {
-                continue;
+                if frame.repeats.is_empty() {
+                    continue;
+                }
+                frame.sequence = frame.repeats.remove(0);
             }
             frame.keyframe_id = first.keyframe_id;
             frame.keyframe_from_camera = SE3::exp(&(motion * ((step - begin_step) / interval)));
@@ -248,31 +254,42 @@ impl Mapper {
     }
 }
 
-/// Where along the camera's motion each frame lies, in frames, and how many of them repeat the image of the frame before:
-/// a repeat is no step of the motion.
+/// Where along the camera's motion each image lies, in frames, and how many frames repeat one: a repeat is no step of the
+/// motion.
 fn steps_of(frames: &[TrackedFrame]) -> (Vec<f64>, f64) {
-    let mut num_repeats = 0.0;
+    let mut num_repeats = 0;
     let mut steps = Vec::with_capacity(frames.len());
-    for (index, frame) in frames.iter().enumerate() {
-        let before = index.checked_sub(1).map(|before| &frames[before].pixels);
-        num_repeats += f64::from(before.is_some_and(|before| Arc::ptr_eq(before, &frame.pixels)));
-        steps.push(frame.sequence as f64 - num_repeats);
+    for frame in frames {
+        steps.push(frame.sequence.saturating_sub(num_repeats) as f64);
+        // Of many repeats only the last are listed.
+        let last = frame.repeats.last().unwrap_or(&frame.sequence);
+        num_repeats += last.saturating_sub(frame.sequence);
     }
-    (steps, num_repeats)
+    (steps, num_repeats as f64)
 }
 
-/// Appends the copy of a frame to a list of at most `most`; the oldest is dropped.
+/// Appends the copy of a frame to a list of at most `most`; the oldest is dropped. A repeat is added to its image, of
+/// whose repeats the oldest is dropped.
 fn push_bounded(
     frames: &mut Vec<TrackedFrame>,
     most: usize,
     (sequence, pixels): (u64, Arc<[u8]>),
     (keyframe_id, at): (u64, &SE3),
 ) {
+    let last = frames.last_mut().filter(|last| Arc::ptr_eq(&last.pixels, &pixels));
+    if let Some(last) = last.filter(|last| last.keyframe_id == keyframe_id) {
+        if last.repeats.len() >= most {
+            last.repeats.remove(0);
+        }
+        last.repeats.push(sequence);
+        return;
+    }
     if frames.len() >= most {
         frames.remove(0);
     }
     frames.push(TrackedFrame {
         sequence,
+        repeats: Vec::new(),
         keyframe_id,
         keyframe_from_camera: *at,
         is_guess: false,
@@ -284,18 +301,44 @@ fn push_bounded(
 mod tests {
     use super::*;
 
-    #[test]
-    fn repeated_images_are_no_steps_of_the_motion() {
+    /// Early frames of at most `most` images: each a sequence and an image.
+    fn early(sent: &[(u64, usize)], most: usize) -> Vec<TrackedFrame> {
         let images: [Arc<[u8]>; 3] = [1, 2, 3].map(|grey| vec![grey; 4].into());
-        let frame = |(sequence, image): (u64, usize)| TrackedFrame {
-            sequence,
-            keyframe_id: NO_KEYFRAME,
-            keyframe_from_camera: SE3::identity(),
-            is_guess: true,
-            pixels: Arc::clone(&images[image]),
-        };
+        let mut frames = Vec::new();
+        for &(sequence, image) in sent {
+            let copy = Arc::clone(&images[image]);
+            push_bounded(&mut frames, most, (sequence, copy), (NO_KEYFRAME, &SE3::identity()));
+        }
+        frames
+    }
+
+    #[test]
+    fn repeated_images_are_kept_once_and_are_no_steps_of_the_motion() {
         // The fourteenth frame was dropped.
-        let frames = [(10, 0), (11, 0), (12, 1), (13, 1), (15, 2), (16, 2)].map(frame);
-        assert_eq!(steps_of(&frames), (vec![10.0, 10.0, 11.0, 11.0, 13.0, 13.0], 3.0));
+        let frames = early(&[(10, 0), (11, 0), (12, 1), (13, 1), (15, 2), (16, 2)], 3);
+        let listed = frames.iter().map(|frame| (frame.sequence, &frame.repeats[..]));
+        assert!(listed.eq([(10, &[11][..]), (12, &[13]), (15, &[16])]));
+        assert_eq!(steps_of(&frames), (vec![10.0, 11.0, 13.0], 3.0));
+    }
+
+    #[test]
+    fn of_many_repeats_the_last_are_listed_and_none_is_a_step() {
+        let sent: Vec<_> = (10..30).map(|sequence| (sequence, 0)).chain([(30, 1)]).collect();
+        let frames = early(&sent, 4);
+        assert_eq!(frames[0].repeats, [26, 27, 28, 29]);
+        assert_eq!(steps_of(&frames), (vec![10.0, 11.0], 19.0));
+    }
+
+    #[test]
+    fn frames_of_another_keyframe_are_kept_apart_though_they_repeat_an_image() {
+        let image: Arc<[u8]> = vec![1; 4].into();
+        let mut frames = Vec::new();
+        for (sequence, keyframe) in [(1, 0), (2, 0), (3, 1), (4, 1)] {
+            let copy = Arc::clone(&image);
+            push_bounded(&mut frames, 9, (sequence, copy), (keyframe, &SE3::identity()));
+        }
+        let listed =
+            frames.iter().map(|frame| (frame.keyframe_id, frame.sequence, &frame.repeats[..]));
+        assert!(listed.eq([(0, 1, &[2][..]), (1, 3, &[4])]));
     }
 }

@@ -40,6 +40,8 @@ pub(super) struct Start {
     pub(super) last_frame: Option<StartFrame>,
     /// Outcome of the last image, which further frames may repeat.
     last_image: StartFrame,
+    /// Whether the last image was taken, in this or an earlier frame.
+    has_image: bool,
 }
 
 impl Start {
@@ -60,6 +62,7 @@ impl Start {
             progress: StartProgress::default(),
             last_frame: None,
             last_image: StartFrame::Begun,
+            has_image: false,
         })
     }
 
@@ -72,21 +75,23 @@ impl Start {
     /// Frees its memory, since a map has started without it.
     pub(super) fn give_up(&mut self) {
         (self.first, self.latest, self.initializer) = (None, None, None);
+        self.has_image = false;
     }
 
     /// Takes a frame; returns the start once parallax is proven. Some frames of a fast camera are left out: a start is
     /// judged in steps of about 30 Hz, and must be proven within a fixed number of them. So is a frame that repeats the
     /// previous image, as in a video converted to a higher rate: it would confirm a motion that a single image shows, and
     /// the camera would seem to have rested before the next one.
-    fn step(&mut self, frame: &FrameView<'_>) -> Option<Proven> {
+    fn step(&mut self, frame: &FrameView<'_>, is_repeat: bool) -> Option<Proven> {
         /// A frame this soon after the previous one is left out, nanoseconds: 45 Hz.
         const TOO_SOON: std::ops::Range<i64> = 1..22_000_000;
         let since = self.latest.map(|(_, nanos)| frame.capture_nanos.saturating_sub(nanos));
         if since.is_some_and(|since| TOO_SOON.contains(&since)) {
             self.last_frame = None;
+            self.has_image &= is_repeat;
             return None;
         }
-        if self.initializer.as_ref().is_some_and(|start| start.is_latest(frame.pixels)) {
+        if is_repeat && self.has_image {
             self.last_frame = Some(match self.last_image {
                 StartFrame::Begun => StartFrame::Still,
                 outcome => outcome,
@@ -97,6 +102,7 @@ impl Start {
             Some(initializer) => initializer,
             None => TwoFrameInitializer::new(self.intrinsics, self.params.clone()).ok()?.into(),
         };
+        self.has_image = true;
         let is_first = initializer.first_pixels().is_empty();
         let outcome = initializer.step(frame.pixels);
         self.last_image = StartFrame::of(&outcome, is_first, frame.pixels);
@@ -139,7 +145,7 @@ impl Mapper {
         // After a map was rejected, a pose on it may still arrive, which is not a given one.
         let is_given = pose.state.is_tracked() && matches!(self.phase, Phase::Starting);
         if sensor_depth.is_none() && !is_given {
-            return match self.start.step(frame) {
+            return match self.start.step(frame, self.copies.is_repeat()) {
                 Some(proven) => self.begin_proven(frame, pose, &proven),
                 None => {
                     self.keep_early_frame(frame);
@@ -235,6 +241,7 @@ impl Mapper {
         proven: &Proven,
     ) -> StepOutcome {
         let Proven { first, outcome: start, initializer } = proven;
+        let is_repeat = self.copies.is_repeat();
         let (origin, unit) = self.origin(pose);
         let first_pixels = initializer.first_pixels();
         self.begin_epoch(first_pixels);
@@ -247,9 +254,10 @@ impl Mapper {
         let first_frame =
             FrameView { sequence: first.0, capture_nanos: first.1, pixels: first_pixels, ..*frame };
         let place = UncertainPose::exact(Sim3::new(origin, unit * scale));
+        // A map starts with two frames in one step, of which this one may repeat the image before it.
+        self.copies.begin_copy();
         self.add_keyframe(&first_frame, &place, epoch);
-        // A map starts with two frames in one step.
-        self.copies.begin_frame();
+        self.copies.begin_copy();
         let pose = PoseEstimate {
             epoch,
             world_from_camera: Sim3::new(origin, unit).transform_pose(&start.first_from_current),
@@ -257,7 +265,7 @@ impl Mapper {
             ..proven_pose(frame, start, scale)
         };
         self.change_keyframe(&StepInput { frame, pose: &pose, sensor_depth: None });
-        self.adopt_early_frames(&pose.keyframe_from_camera);
+        self.adopt_early_frames(&pose.keyframe_from_camera, is_repeat);
         StepOutcome { observations, ..StepOutcome::map_started() }
     }
 
@@ -331,6 +339,7 @@ mod tests {
     use super::*;
     use crate::slam::mapper::MapperParams;
     use crate::slam::test_scene::{CAMERA, Scene};
+    use crate::slam::window::frames::TrackedFrame;
 
     /// Time from frame to frame at 30 Hz.
     const PERIOD_NANOS: i64 = 33_333_333;
@@ -345,7 +354,7 @@ mod tests {
             for sequence in 0..300 {
                 let pixels = &image.noisy(2.0, sequence);
                 let nanos = sequence as i64 * 1_000_000_000 / rate;
-                start.step(&FrameView::new(&CAMERA, sequence, nanos, pixels));
+                start.step(&FrameView::new(&CAMERA, sequence, nanos, pixels), false);
                 taken += usize::from(start.last_frame.is_some());
                 if start.progress.failures > 0 {
                     return (taken, nanos as f64 * 1e-9);
@@ -370,13 +379,14 @@ mod tests {
     fn proven_with(params: &TwoFrameParams, times: u64) -> (Proven, Vec<u8>) {
         let mut start = Start::new(CAMERA, params).unwrap();
         let proven = (0..3 * times).find_map(|sent| {
-            let frame = sent / times;
-            let moved = Vector6::new(0.0, 0.0, 0.2 * frame as f64, 0.0, 0.0, 0.0);
-            let pixels = Scene::new(1).render(&CAMERA, &SE3::exp(&moved)).noisy(2.0, 100 + frame);
+            let image = sent / times;
+            let moved = Vector6::new(0.0, 0.0, 0.2 * image as f64, 0.0, 0.0, 0.0);
+            let pixels = Scene::new(1).render(&CAMERA, &SE3::exp(&moved)).noisy(2.0, 100 + image);
             let nanos = PERIOD_NANOS * sent as i64;
-            let proven = start.step(&FrameView::new(&CAMERA, 10 + sent, nanos, &pixels));
+            let frame = FrameView::new(&CAMERA, 10 + sent, nanos, &pixels);
+            let proven = start.step(&frame, sent % times > 0);
             let repeated = [StartFrame::Still, StartFrame::LittleParallax];
-            let expected = repeated.get(frame as usize).copied();
+            let expected = repeated.get(image as usize).copied();
             assert!(sent % times == 0 || start.last_frame == expected, "{:?}", start.last_frame);
             Some((proven?, pixels))
         });
@@ -390,6 +400,50 @@ mod tests {
         assert_eq!(pixels, last);
         assert_eq!(repeated.outcome, once.outcome);
         assert_eq!(repeated.first, once.first);
+    }
+
+    #[test]
+    fn a_map_from_a_doubled_video_is_that_of_its_images() {
+        /// Sends the images at these places, each as it is or compressed again; returns the images of the first two
+        /// keyframes, the second one's pose, and all poses of frames before it.
+        fn map_from(sent: &[(u64, bool)], hz: i64) -> ([Vec<u8>; 2], SE3, Vec<TrackedFrame>) {
+            let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+            for (sequence, &(image, is_again)) in (0..).zip(sent) {
+                let pixels = seen(image, is_again);
+                let frame = FrameView::new(
+                    &CAMERA,
+                    sequence,
+                    sequence as i64 * 1_000_000_000 / hz,
+                    &pixels,
+                );
+                mapper.step(&frame, &PoseEstimate::unknown(&frame), None, &mut || {});
+            }
+            let [first, second] = &mapper.map.keyframes[..] else { panic!("no map") };
+            let images = [first, second].map(|keyframe| keyframe.image.to_vec());
+            (images, second.world_from_keyframe.rigid, mapper.tracked.clone())
+        }
+        fn seen(image: u64, is_again: bool) -> Vec<u8> {
+            let moved = Vector6::new(0.0, 0.0, 0.2 * image as f64, 0.0, 0.0, 0.0);
+            let pixels = Scene::new(1).render(&CAMERA, &SE3::exp(&moved)).noisy(2.0, 100 + image);
+            let greys = pixels.iter().enumerate();
+            greys
+                .map(|(at, &grey)| if is_again && at % 7 == 0 { grey.max(2) ^ 1 } else { grey })
+                .collect()
+        }
+        let (once, pose, before) = map_from(&[(0, false), (1, false), (2, false)], 30);
+        assert_eq!(once, [seen(0, false), seen(2, false)]);
+        let twice = [0, 1, 2].map(|image| [(image, false), (image, true)]).concat();
+        let (images, doubled, guesses) = map_from(&twice[..5], 30);
+        assert_eq!((images, doubled), (once, pose));
+        let guess = |frames: &[TrackedFrame]| frames[frames.len() - 1].keyframe_from_camera;
+        assert_eq!(guess(&before), guess(&guesses));
+        assert_eq!(
+            guesses.iter().map(|frame| &frame.repeats[..]).collect::<Vec<_>>(),
+            [&[][..], &[3]]
+        );
+        // At 60 Hz, and from a repeat on, every second frame is left out as too soon: the others are repeats.
+        let (images, ..) = map_from(&twice[1..], 60);
+        assert_eq!(images, [seen(0, true), seen(2, true)]);
     }
 
     #[test]

@@ -15,6 +15,7 @@ use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
+use crate::slam::image::repeats::Repeats;
 use crate::slam::image::sums::SumPyramid;
 use crate::slam::pose::{
     Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState, full_covariance,
@@ -84,6 +85,8 @@ pub(super) struct Turning {
     coarse_fit: Option<f64>,
     /// The previous frame.
     before: SumPyramid,
+    /// Paused while a frame is rehearsed.
+    pub(super) repeats: Repeats,
     /// Which frame is in which buffer.
     frames: Frames,
     /// Whether the frame in the tracker's pyramid is to be the view.
@@ -157,6 +160,7 @@ impl Turning {
             is_first: true,
             coarse_fit: None,
             before: pyramid.clone(),
+            repeats: Repeats::with_size_of(pyramid),
             frames: Frames::default(),
             is_due: false,
         }
@@ -166,11 +170,6 @@ impl Turning {
     pub(super) fn keep(&mut self, pyramid: &mut SumPyramid, sequence: u64) {
         std::mem::swap(&mut self.before, pyramid);
         self.frames.before = self.frames.filled.replace(sequence);
-    }
-
-    /// Whether the frame in `pyramid` repeats the image of the previous one.
-    pub(super) fn is_repeat(&self, pyramid: &SumPyramid) -> bool {
-        self.frames.before.is_some() && self.before == *pyramid
     }
 
     /// Makes the frame in `pyramid` the view, if that is due; the contents of the old view are left in its place.
@@ -191,6 +190,7 @@ impl Turning {
 
     /// Saves the state before a frame is rehearsed: nothing is held meanwhile.
     pub(super) fn pause(&mut self) -> SavedView {
+        self.repeats.is_paused = true;
         SavedView { place: self.place.take(), frames: std::mem::take(&mut self.frames) }
     }
 
@@ -198,7 +198,7 @@ impl Turning {
     pub(super) fn resume(&mut self, paused: SavedView, pyramid: &mut SumPyramid) {
         std::mem::swap(&mut self.before, pyramid);
         (self.place, self.frames) = (paused.place, paused.frames);
-        self.is_due = false;
+        (self.is_due, self.repeats.is_paused) = (false, false);
     }
 
     /// Makes the frame of `estimate` the next view.
@@ -233,7 +233,7 @@ impl Tracker {
         mut before: Memory,
         budget: &mut dyn FnMut(usize) -> bool,
     ) -> Option<PoseEstimate> {
-        before.motion.begin_frame(self.turning.is_repeat(&self.pyramid));
+        before.motion.begin_frame(self.turning.repeats.is_repeat());
         if self.turning.place.is_none() {
             self.begin_turning(&before, reference.mean_depth_in_world());
         }

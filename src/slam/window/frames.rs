@@ -36,6 +36,8 @@ const MIN_INLIER_RATIO: f64 = 0.5;
 pub struct TrackedFrame {
     /// Its sequence number.
     pub sequence: u64,
+    /// Those of the frames after it that repeat its image.
+    pub repeats: Vec<u64>,
     /// The keyframe that it was tracked on.
     pub keyframe_id: u64,
     /// Its pose on the keyframe, in the keyframe's unit.
@@ -57,6 +59,15 @@ pub(super) struct WindowFrames {
     is_begun: bool,
     /// Whether that alignment is done.
     is_done: bool,
+}
+
+impl WindowFrames {
+    /// Keeps the pose that was found for a frame, if any, for it and its repeats.
+    fn place(&mut self, frame: &TrackedFrame, placed: Option<RealignedFrame>) {
+        let Some(placed) = placed else { return };
+        let repeats = frame.repeats.iter().map(|&sequence| RealignedFrame { sequence, ..placed });
+        self.placed.extend([placed].into_iter().chain(repeats));
+    }
 }
 
 impl Window {
@@ -142,7 +153,7 @@ impl Window {
             }
             left -= 1;
             let placed = index.and_then(|index| self.realign_frame(index, frame));
-            self.frames.placed.extend(placed);
+            self.frames.place(frame, placed);
             false
         });
         self.frames.waiting = waiting;
@@ -173,7 +184,7 @@ impl Window {
             let mut found = placed.keyframe_from_camera;
             found.translation /= self.keyframes[index].unit;
             found_off = Some((keyframe_id, found * guess.inverse()));
-            self.frames.placed.push(placed);
+            self.frames.place(&frame, Some(placed));
         }
         // The remaining ones start with that correction.
         let Some((keyframe_id, off)) = found_off else { return };
@@ -248,6 +259,7 @@ mod tests {
     fn frame(keyframe_id: u64) -> TrackedFrame {
         TrackedFrame {
             sequence: keyframe_id,
+            repeats: Vec::new(),
             keyframe_id,
             keyframe_from_camera: SE3::identity(),
             is_guess: false,
