@@ -9,9 +9,12 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::map::RealignedFrame;
 use crate::slam::window::{ALIGNMENT_LEVELS, Window};
 
-/// Frames aligned with one adjustment: twice as many as lie between two keyframes, so that the backlog of an epoch's
-/// first keyframes is cleared without delaying it.
+/// Frames aligned with one adjustment: twice as many as lie between two keyframes at 30 Hz, so that the backlog of an
+/// epoch's first keyframes is cleared without delaying it.
 const MAX_FRAMES_AT_ONCE: usize = 30;
+/// … and of a camera at 60 or 120 Hz as many more as wait beyond this share of the most that may wait: at the limit those
+/// that have waited longest are dropped. Below it frames wait, as poses and points still improve.
+const BACKLOG_SHARE: f64 = 0.5;
 /// Up to this many are aligned in the time of one or two frames.
 const FEW_FRAMES: usize = 8;
 /// Keyframes after its own that a frame of an epoch's first keyframes waits for: all of these move with each estimate,
@@ -126,7 +129,10 @@ impl Window {
 
     /// Aligns the frames whose keyframes enough others have followed, more among an epoch's first ones.
     fn realign_frames(&mut self, newest: usize, is_first: bool) {
-        self.realign_frames_before(self.num_followed(newest, is_first), MAX_FRAMES_AT_ONCE);
+        let backlog = (BACKLOG_SHARE * self.params.max_waiting_frames as f64) as usize;
+        let excess = self.frames.waiting.len().saturating_sub(backlog);
+        let most = MAX_FRAMES_AT_ONCE.max(excess);
+        self.realign_frames_before(self.num_followed(newest, is_first), most);
     }
 
     /// Number of keyframes that enough others have followed.
@@ -315,6 +321,32 @@ mod tests {
         };
         assert_eq!(left(true), [4, 5, 6, 7]);
         assert_eq!(left(false), [7]);
+    }
+
+    #[test]
+    fn frames_of_a_fast_camera_are_aligned_before_they_would_be_dropped() {
+        for (waiting, left) in [(20, 0), (80, 50), (130, 100), (190, 100)] {
+            let mut window = window();
+            window.frames.waiting = vec![frame(3); waiting];
+            window.realign_frames(7, false);
+            assert_eq!(window.frames.waiting.len(), left, "{waiting}");
+        }
+    }
+
+    #[test]
+    fn repeats_get_the_pose_of_their_image() {
+        let mut frames = WindowFrames::default();
+        let frame = TrackedFrame { repeats: vec![4, 5], ..frame(3) };
+        let placed = RealignedFrame {
+            sequence: 3,
+            keyframe_id: 1,
+            keyframe_from_camera: SE3::exp(&Vector6::repeat(0.1)),
+        };
+        frames.place(&frame, None);
+        assert!(frames.placed.is_empty());
+        frames.place(&frame, Some(placed));
+        let expected = [3, 4, 5].map(|sequence| RealignedFrame { sequence, ..placed });
+        assert_eq!(frames.placed, expected);
     }
 
     #[test]
