@@ -216,10 +216,14 @@ impl Mapper {
     ) -> StepOutcome {
         let finished = self.finish_keyframe();
         self.start.last_frame = None;
-        if frame.is_consistent() {
+        let size = (self.intrinsics.width, self.intrinsics.height);
+        let outcome = if frame.is_consistent() && (frame.width, frame.height) == size {
             self.copies.begin_frame(frame);
-        }
-        let outcome = self.step_inner(&StepInput { frame, pose, sensor_depth }, change_begins);
+            self.start.has_image &= self.copies.is_repeat();
+            self.step_inner(&StepInput { frame, pose, sensor_depth }, change_begins)
+        } else {
+            StepOutcome::default()
+        };
         let is_told = self.publish_doubt();
         let keyframe_changed = outcome.keyframe_changed || finished.keyframe_changed || is_told;
         StepOutcome { keyframe_changed, ..outcome }
@@ -231,11 +235,6 @@ impl Mapper {
         change_begins: &mut dyn FnMut(),
     ) -> StepOutcome {
         let StepInput { frame, pose, .. } = *input;
-        if !frame.is_consistent()
-            || (frame.width, frame.height) != (self.intrinsics.width, self.intrinsics.height)
-        {
-            return StepOutcome::default();
-        }
         let Some(keyframe) = self.keyframe() else {
             return match self.is_localising() {
                 true => {
@@ -279,8 +278,10 @@ impl Mapper {
     fn extend(&mut self, input: &StepInput<'_>, change_begins: &mut dyn FnMut()) -> StepOutcome {
         let StepInput { frame, pose, .. } = *input;
         self.queue_frame(frame, pose);
-        if self.copies.is_repeat() {
-            // Its noise is the previous frame's: observed twice, depth would seem more certain than it is.
+        if self.copies.repeats_copied() {
+            // Its noise is the previous frame's: observed twice, depth would seem more certain than it is. The next
+            // frame may repeat it again.
+            self.copies.of(frame);
             return StepOutcome::default();
         }
         self.guess_unit(&pose.keyframe_from_camera);

@@ -350,7 +350,7 @@ impl Tracker {
         }
         self.turning.keep(&mut self.pyramid, frame.sequence);
         self.pyramid.fill(frame.pixels);
-        self.memory.motion.begin_frame(self.turning.repeats.observe(&self.pyramid));
+        self.memory.motion.begin_frame(!self.turning.repeats.observe(&self.pyramid).is_new());
         let flat = self.pyramid.contrast() < self.params.min_contrast;
         flat.then_some(LostReason::UnusableFrame)
     }

@@ -3,30 +3,53 @@
 
 use crate::slam::image::sums::{SumPyramid, grey_per_sum};
 
-/// Level that is compared: noise of single pixels averages out in its blocks of 8×8.
+/// Level that is compared, or the coarsest: noise of single pixels averages out in its blocks of 8×8.
 const LEVEL: usize = 3;
 
-/// Largest change of a repeated image, mean over blocks, grey levels: what noise of 4 grey levels, added anew to every
-/// pixel, leaves. H.264 leaves up to 0.2; a hand-held camera's least change in 1349 frames was 0.5.
+/// Largest change of a repeated image, mean over blocks, grey levels: what noise of 3.5 grey levels, different in every
+/// image, leaves. H.264 leaves up to 0.2; a hand-held camera's least change in 1349 frames was 0.5.
 const MAX_CHANGE: f64 = 0.5;
 
-/// … and as a share of the change before it. H.264 leaves up to 0.04; that camera's steps shrank to 0.095 at most.
+/// … and as a share of the least of the last changes. H.264 leaves up to 0.04; a frame of that camera changed by 0.095 of
+/// the change before it.
 const MAX_CHANGE_RATIO: f64 = 0.1;
 
+/// Number of those: a flash is two.
+const NUM_CHANGES: usize = 3;
+
 /// Most frames in a row that repeat an image nearly: as many as in a video at three times its rate. After them the camera
-/// stands still.
-const MAX_INEXACT: u32 = 2;
+/// rests.
+const MAX_NEAR_REPEATS: u32 = 2;
+
+/// What a frame shows.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Shown {
+    /// Another image than the frames before it.
+    #[default]
+    New,
+    /// The same image.
+    Repeat,
+    /// Nearly the same, once more than a video of a moving camera would repeat it: the camera rests.
+    Rest,
+}
+
+impl Shown {
+    /// Whether it shows another image.
+    pub fn is_new(self) -> bool {
+        self == Self::New
+    }
+}
 
 /// The last image that repeats none, to which frames are compared.
 #[derive(Debug, Default)]
 pub struct Repeats {
     blocks: Vec<u16>,
-    /// By how much it differed from the one before it, grey levels.
-    change: Option<f64>,
+    /// By how much each of the last images differed from the one before it, grey levels; the newest last.
+    changes: [Option<f64>; NUM_CHANGES],
     /// Number of frames since that repeat it nearly.
-    inexact: u32,
-    /// Whether the last frame repeats it.
-    is_repeat: bool,
+    near_repeats: u32,
+    /// What the last frame shows.
+    shown: Shown,
     /// Set while the last frame is taken again.
     pub is_paused: bool,
 }
@@ -41,37 +64,39 @@ impl Repeats {
         Self { blocks: Vec::with_capacity(blocks.len()), ..Self::default() }
     }
 
-    /// Takes the next frame; returns whether it repeats the image before it.
-    pub fn observe(&mut self, pyramid: &SumPyramid) -> bool {
+    /// Takes the next frame; returns what it shows.
+    pub fn observe(&mut self, pyramid: &SumPyramid) -> Shown {
         if !self.is_paused {
-            self.is_repeat = self.compare(pyramid);
+            self.shown = self.compare(pyramid);
         }
-        self.is_repeat
+        self.shown
     }
 
-    /// Whether the last frame repeats the image before it.
-    pub fn is_repeat(&self) -> bool {
-        self.is_repeat
+    /// What the last frame shows.
+    pub fn shown(&self) -> Shown {
+        self.shown
     }
 
-    fn compare(&mut self, pyramid: &SumPyramid) -> bool {
+    fn compare(&mut self, pyramid: &SumPyramid) -> Shown {
         let (level, blocks) = compared(pyramid);
-        let change =
-            mean_difference(&self.blocks, blocks).map(|sum| sum * f64::from(grey_per_sum(level)));
+        let sums = mean_difference(&self.blocks, blocks);
+        let change = sums.map(|sums| sums * f64::from(grey_per_sum(level)));
         if change == Some(0.0) {
-            return true;
+            return Shown::Repeat;
         }
-        let is_small = |change: f64| {
-            change <= MAX_CHANGE && self.change.is_none_or(|last| change <= MAX_CHANGE_RATIO * last)
-        };
-        if self.inexact < MAX_INEXACT && change.is_some_and(is_small) {
-            self.inexact += 1;
-            return true;
+        let least = self.changes.iter().flatten().copied().fold(f64::INFINITY, f64::min);
+        let most = MAX_CHANGE.min(MAX_CHANGE_RATIO * least);
+        let is_near = change.is_some_and(|change| change <= most);
+        if is_near && self.near_repeats < MAX_NEAR_REPEATS {
+            self.near_repeats += 1;
+            return Shown::Repeat;
         }
         self.blocks.clear();
         self.blocks.extend_from_slice(blocks);
-        (self.change, self.inexact) = (change, 0);
-        false
+        self.changes.rotate_left(1);
+        self.changes[NUM_CHANGES - 1] = change;
+        self.near_repeats = 0;
+        if is_near { Shown::Rest } else { Shown::New }
     }
 }
 
@@ -82,33 +107,33 @@ fn compared(pyramid: &SumPyramid) -> (usize, &[u16]) {
     (level, pyramid.level(level).pixels())
 }
 
-/// Mean absolute difference of the blocks that have data in both; `None` where there are none.
+/// Mean absolute difference of the blocks with data; `None` where there are none.
 fn mean_difference(one: &[u16], other: &[u16]) -> Option<f64> {
     if one.len() != other.len() {
         return None;
     }
     let (mut sum, mut count) = (0, 0);
     for (&one, &other) in one.iter().zip(other) {
-        let has_data = one.min(other) > 0;
-        sum += if has_data { u64::from(one.abs_diff(other)) } else { 0 };
-        count += u64::from(has_data);
+        sum += u64::from(one.abs_diff(other));
+        count += u64::from(one.max(other) > 0);
     }
     (count > 0).then(|| sum as f64 / count as f64)
 }
 
 #[cfg(test)]
 mod tests {
+    use super::Shown::{New, Repeat, Rest};
     use super::*;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::test_scene::{CAMERA, Scene};
 
-    /// Which frames repeat the one before, of a camera that is at `steps` and whose images have this noise.
-    fn repeats(steps: &[f64], noise: f64) -> Vec<bool> {
+    /// What the frames show of a camera that is at `places` and whose images have this noise.
+    fn shown(places: &[f64], noise: f64) -> Vec<Shown> {
         let scene = Scene::new(1);
         let mut pyramid =
             SumPyramid::with_size(CAMERA.width, CAMERA.height, Repeats::NUM_LEVELS, 1);
         let mut repeats = Repeats::with_size_of(&pyramid);
-        let frames = steps.iter().zip(0..).map(|(&x, seed)| {
+        let frames = places.iter().zip(0..).map(|(&x, seed)| {
             let pose = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
             pyramid.fill(&scene.render(&CAMERA, &pose).noisy(noise, seed));
             repeats.observe(&pyramid)
@@ -120,45 +145,70 @@ mod tests {
     fn images_of_a_doubled_or_tripled_rate_are_repeats() {
         for noise in [0.0, 2.0] {
             let doubled = [0.0, 0.0, 0.1, 0.1, 0.2, 0.2];
-            assert_eq!(
-                repeats(&doubled, noise),
-                [false, true, false, true, false, true],
-                "{noise}"
-            );
+            assert_eq!(shown(&doubled, noise), [New, Repeat, New, Repeat, New, Repeat], "{noise}");
             let tripled = [0.0, 0.1, 0.1, 0.1, 0.2];
-            assert_eq!(repeats(&tripled, noise), [false, false, true, true, false], "{noise}");
+            assert_eq!(shown(&tripled, noise), [New, New, Repeat, Repeat, New], "{noise}");
         }
     }
 
     #[test]
     fn of_a_camera_that_rests_two_noisy_images_count_as_repeats_and_all_exact_ones() {
         let rests = [0.0, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.2];
-        let two = [false, false, true, true, false, false, false, false];
-        assert_eq!(repeats(&rests, 2.0), two);
-        assert_eq!(
-            repeats(&rests, 0.0),
-            rests.map(|x| x == 0.1).map({
-                let mut is_first = true;
-                move |at_rest| at_rest && !std::mem::take(&mut is_first)
-            })
-        );
+        let noisy = [New, New, Repeat, Repeat, Rest, New, New, New];
+        assert_eq!(shown(&rests, 2.0), noisy);
+        let exact = [New, New, Repeat, Repeat, Repeat, Repeat, Repeat, New];
+        assert_eq!(shown(&rests, 0.0), exact);
     }
 
     #[test]
     fn a_camera_that_moves_slower_and_slower_repeats_nothing() {
         let slower: Vec<_> = (0..8).map(|k| 0.2 * (1.0 - 0.3_f64.powi(k))).collect();
-        assert!(repeats(&slower, 0.0).iter().all(|is_repeat| !is_repeat));
+        assert!(shown(&slower, 0.0).iter().all(|&shown| shown == New));
     }
 
     #[test]
-    fn images_without_common_data_or_of_another_size_are_none() {
+    fn after_a_flash_a_slow_camera_repeats_nothing() {
+        let mut repeats = Repeats::default();
+        let mut pyramid = SumPyramid::with_size(64, 64, Repeats::NUM_LEVELS, 1);
+        // A step brightens a quarter of the pixels by one; step 0 is the flash.
+        let seen = [1, 4, 7, 0, 8, 9, 10].map(|step: usize| {
+            let mut pixels = vec![if step == 0 { 200 } else { 100 }; 64 * 64];
+            pixels.iter_mut().step_by(4).for_each(|grey| *grey += step as u8);
+            pyramid.fill(&pixels);
+            repeats.observe(&pyramid)
+        });
+        assert_eq!(seen, [New; 7]);
+    }
+
+    #[test]
+    fn the_change_is_that_of_the_blocks_with_data() {
+        let (width, height) = (64, 64);
+        for (rows, last) in [(height, Repeat), (8, New)] {
+            let mut repeats = Repeats::default();
+            let mut pyramid = SumPyramid::with_size(width, height, Repeats::NUM_LEVELS, 1);
+            let mut seen = |grey: u8, raised: usize| {
+                let mut pixels = vec![0; width * height];
+                pixels[..rows * width].fill(grey);
+                pixels[..raised * 8 * width].iter_mut().for_each(|grey| *grey += 1);
+                pyramid.fill(&pixels);
+                repeats.observe(&pyramid)
+            };
+            // The upper eighth brightens by one.
+            let seen = [seen(100, 0), seen(150, 0), seen(150, 1)];
+            assert_eq!(seen, [New, New, last], "{rows} rows");
+        }
+    }
+
+    #[test]
+    fn images_without_data_or_of_another_size_are_none() {
         let mut repeats = Repeats::default();
         for (side, grey) in [(64, 0), (64, 0), (64, 9), (64, 0), (32, 9), (32, 9)] {
             let mut pyramid = SumPyramid::with_size(side, side, Repeats::NUM_LEVELS, 1);
             pyramid.fill(&vec![grey; side * side]);
             let is_second = repeats.blocks.len() == 16 && grey == 9 && side == 32;
-            assert_eq!(repeats.observe(&pyramid), is_second, "{side} {grey}");
+            let expected = if is_second { Repeat } else { New };
+            assert_eq!(repeats.observe(&pyramid), expected, "{side} {grey}");
         }
-        assert!(!repeats.observe(&SumPyramid::default()));
+        assert_eq!(repeats.observe(&SumPyramid::default()), New);
     }
 }

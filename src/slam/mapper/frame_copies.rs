@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::slam::frame::FrameView;
-use crate::slam::image::repeats::Repeats;
+use crate::slam::image::repeats::{Repeats, Shown};
 use crate::slam::image::sums::SumPyramid;
 
 /// Most unused copies that are kept for later frames, one byte a pixel each: as many as lie between two keyframes.
@@ -23,7 +23,7 @@ pub(super) struct FrameCopies {
 }
 
 impl FrameCopies {
-    /// Begins a new frame, which is consistent.
+    /// Begins a new frame, which is consistent and of the camera's size.
     pub(super) fn begin_frame(&mut self, frame: &FrameView<'_>) {
         self.begin_copy();
         let (width, height) = (frame.width, frame.height);
@@ -31,7 +31,7 @@ impl FrameCopies {
             self.pyramid = SumPyramid::with_size(width, height, Repeats::NUM_LEVELS, 1);
         }
         self.pyramid.fill(frame.pixels);
-        self.is_repeat = self.repeats.observe(&self.pyramid);
+        self.is_repeat = self.repeats.observe(&self.pyramid) == Shown::Repeat;
     }
 
     /// Begins another copy.
@@ -43,6 +43,11 @@ impl FrameCopies {
     /// Whether the current frame repeats the image of the previous one.
     pub(super) fn is_repeat(&self) -> bool {
         self.is_repeat
+    }
+
+    /// Whether that image was copied: a frame that was not used, as a lost one, has no copy.
+    pub(super) fn repeats_copied(&self) -> bool {
+        self.is_repeat && self.previous.is_some()
     }
 
     /// The grey values of the current frame, copied at the first call; of a repeat the previous frame's.

@@ -263,7 +263,7 @@ fn steps_of(frames: &[TrackedFrame]) -> (Vec<f64>, f64) {
         steps.push(frame.sequence.saturating_sub(num_repeats) as f64);
         // Of many repeats only the last are listed.
         let last = frame.repeats.last().unwrap_or(&frame.sequence);
-        num_repeats += last.saturating_sub(frame.sequence);
+        num_repeats = num_repeats.saturating_add(last.saturating_sub(frame.sequence));
     }
     (steps, num_repeats as f64)
 }

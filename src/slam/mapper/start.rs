@@ -40,8 +40,8 @@ pub(super) struct Start {
     pub(super) last_frame: Option<StartFrame>,
     /// Outcome of the last image, which further frames may repeat.
     last_image: StartFrame,
-    /// Whether the last image was taken, in this or an earlier frame.
-    has_image: bool,
+    /// Whether the last image was taken, from this or an earlier frame.
+    pub(super) has_image: bool,
 }
 
 impl Start {
@@ -88,7 +88,6 @@ impl Start {
         let since = self.latest.map(|(_, nanos)| frame.capture_nanos.saturating_sub(nanos));
         if since.is_some_and(|since| TOO_SOON.contains(&since)) {
             self.last_frame = None;
-            self.has_image &= is_repeat;
             return None;
         }
         if is_repeat && self.has_image {
@@ -155,6 +154,8 @@ impl Mapper {
         }
         self.early.clear();
         self.start.give_up();
+        // Depth and image of the keyframe are from this frame, though it may repeat one nearly.
+        self.copies.begin_copy();
         let (origin, _) = self.origin(pose);
         self.begin_epoch(frame.pixels);
         if let Some(sensor) = sensor_depth {
@@ -405,7 +406,7 @@ mod tests {
     #[test]
     fn a_map_from_a_doubled_video_is_that_of_its_images() {
         /// Sends the images at these places, each as it is or compressed again; returns the images of the first two
-        /// keyframes, the second one's pose, and all poses of frames before it.
+        /// keyframes, the second one's pose on the first, and the guesses for other frames.
         fn map_from(sent: &[(u64, bool)], hz: i64) -> ([Vec<u8>; 2], SE3, Vec<TrackedFrame>) {
             let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
             for (sequence, &(image, is_again)) in (0..).zip(sent) {
@@ -420,7 +421,9 @@ mod tests {
             }
             let [first, second] = &mapper.map.keyframes[..] else { panic!("no map") };
             let images = [first, second].map(|keyframe| keyframe.image.to_vec());
-            (images, second.world_from_keyframe.rigid, mapper.tracked.clone())
+            let second = &second.world_from_keyframe.rigid;
+            let place = first.world_from_keyframe.inverse_transform_pose(second);
+            (images, place, mapper.tracked.clone())
         }
         fn seen(image: u64, is_again: bool) -> Vec<u8> {
             let moved = Vector6::new(0.0, 0.0, 0.2 * image as f64, 0.0, 0.0, 0.0);
@@ -442,7 +445,10 @@ mod tests {
             [&[][..], &[3]]
         );
         // At 60 Hz, and from a repeat on, every second frame is left out as too soon: the others are repeats.
-        let (images, ..) = map_from(&twice[1..], 60);
+        let (images, place, guesses) = map_from(&twice[1..], 60);
+        // The last of them shows the second keyframe's image.
+        let off = guess(&guesses).inverse() * place;
+        assert!(off.log().norm() < 1e-9 && place.log().norm() > 0.1, "{off:?}");
         assert_eq!(images, [seen(0, true), seen(2, true)]);
     }
 

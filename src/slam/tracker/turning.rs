@@ -233,7 +233,7 @@ impl Tracker {
         mut before: Memory,
         budget: &mut dyn FnMut(usize) -> bool,
     ) -> Option<PoseEstimate> {
-        before.motion.begin_frame(self.turning.repeats.is_repeat());
+        before.motion.begin_frame(!self.turning.repeats.shown().is_new());
         if self.turning.place.is_none() {
             self.begin_turning(&before, reference.mean_depth_in_world());
         }

@@ -12,8 +12,8 @@ use crate::slam::window::{ALIGNMENT_LEVELS, Window};
 /// Frames aligned with one adjustment: twice as many as lie between two keyframes at 30 Hz, so that the backlog of an
 /// epoch's first keyframes is cleared without delaying it.
 const MAX_FRAMES_AT_ONCE: usize = 30;
-/// … and of a camera at 60 or 120 Hz as many more as wait beyond this share of the most that may wait: at the limit those
-/// that have waited longest are dropped. Below it frames wait, as poses and points still improve.
+/// … or, of a camera at 60 or 120 Hz, as many as wait beyond this share of the most that may: at that limit those that
+/// have waited longest are dropped. Up to the share frames wait, as poses and points still improve.
 const BACKLOG_SHARE: f64 = 0.5;
 /// Up to this many are aligned in the time of one or two frames.
 const FEW_FRAMES: usize = 8;
