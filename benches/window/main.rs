@@ -158,6 +158,7 @@ fn walk(
         for between in index + 1..end {
             let world_from_camera = truth[between].world_from_camera;
             frames.push(TrackedFrame {
+                repeats: Vec::new(),
                 sequence: between as u64,
                 keyframe_id: id as u64,
                 keyframe_from_camera: world_from_keyframe.inverse() * world_from_camera,

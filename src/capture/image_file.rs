@@ -66,6 +66,12 @@ impl ImageFileReader {
             .map_err(|source| ImageFileError::Decode { path: path.to_owned(), source })
     }
 
+    /// Whether any pixel of the file that was read last, which has `width * height` pixels, is transparent.
+    pub fn is_transparent(&self, width: usize, height: usize) -> Result<bool, DecodeError> {
+        let is_png = self.bytes.starts_with(&png_image::SIGNATURE);
+        Ok(is_png && png_image::is_transparent(&self.bytes, width, height)?)
+    }
+
     /// Reads the 16-bit grey PNG at `path` as depth in metres, 0 where there is none.
     pub fn read_depth(
         &mut self,

@@ -28,7 +28,8 @@ impl Mask {
         let Intrinsics { width, height, .. } = source.intrinsics();
         let mut raw = vec![0; width * height];
         let refused = |problem| SourceError::Mask { path: path.to_owned(), problem };
-        match ImageFileReader::default().read_gray_into(path, width, height, &mut raw) {
+        let mut reader = ImageFileReader::default();
+        match reader.read_gray_into(path, width, height, &mut raw) {
             Err(ImageFileError::Decode { source: DecodeError::Size { found, .. }, .. }) => {
                 return Err(refused(format!(
                     "this mask has {}x{} pixels and the camera's images {width}x{height}; draw it over one of them",
@@ -39,6 +40,14 @@ impl Mask {
                 return Err(refused(format!("this mask cannot be read: {source}; check the path")));
             }
             read => read?,
+        }
+        // The colours of such pixels are whatever the paint program left there.
+        if reader.is_transparent(width, height).unwrap_or(false) {
+            return Err(refused(
+                "this mask is transparent in places; save it without transparency, the robot black and \
+                 everything else white"
+                    .to_owned(),
+            ));
         }
         raw.iter_mut().for_each(|grey| *grey = if *grey < MIN_WHITE { 0 } else { u8::MAX });
         // Pixels that are black only in part show some of the robot.
@@ -167,8 +176,29 @@ mod tests {
         );
         let text = refusal(&written(folder.path(), SIZE, |u, _| if u < 20 { 255 } else { 0 }));
         assert!(text.contains("leaves 12 % of the image") && text.contains("inverted"), "{text}");
-        File::create(folder.path().join("mask.png")).unwrap();
-        assert!(refusal(&folder.path().join("mask.png")).contains("is empty"));
+        let path = folder.path().join("mask.png");
+        File::create(&path).unwrap();
+        assert!(refusal(&path).contains("is empty"));
         assert!(refusal(&folder.path().join("none.png")).contains("cannot be read"));
+    }
+
+    #[test]
+    fn a_mask_that_is_transparent_in_places_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let source = source(folder.path(), false);
+        let path = folder.path().join("mask.png");
+        for (color, erased) in [(png::ColorType::Rgba, 254), (png::ColorType::GrayscaleAlpha, 0)] {
+            for alpha in [u8::MAX, erased] {
+                let mut pixels = vec![u8::MAX; SIZE[0] * SIZE[1] * color.samples()];
+                pixels[70 * color.samples() - 1] = alpha;
+                let [width, height] = SIZE.map(|side| side as u32);
+                let mut encoder = png::Encoder::new(File::create(&path).unwrap(), width, height);
+                encoder.set_color(color);
+                encoder.write_header().unwrap().write_image_data(&pixels).unwrap();
+                let read = Mask::read(&path, &source).map_err(|refused| refused.to_string());
+                assert_eq!(read.is_ok(), alpha == u8::MAX, "{color:?} {alpha}");
+                assert!(read.is_ok_and(|mask| mask.hidden() == 0.0) || alpha == erased);
+            }
+        }
     }
 }

@@ -56,6 +56,19 @@ pub fn decode_gray_into(
     Ok(())
 }
 
+/// Whether any pixel of a PNG of `width * height` pixels is transparent, even in part.
+pub fn is_transparent(bytes: &[u8], width: usize, height: usize) -> Result<bool, DecodeError> {
+    let wanted = Transformations::EXPAND | Transformations::STRIP_16;
+    let mut reader = open(bytes, width, height, wanted)?;
+    let (color, _) = reader.output_color_type();
+    if !matches!(color, ColorType::GrayscaleAlpha | ColorType::Rgba) {
+        return Ok(false);
+    }
+    let mut samples = vec![0; width * height * color.samples()];
+    finish(&mut reader, &mut samples)?;
+    Ok(samples.chunks_exact(color.samples()).any(|pixel| pixel.last() < Some(&u8::MAX)))
+}
+
 /// Decodes a 16-bit grey PNG of `width * height` pixels into its raw samples.
 pub fn decode_u16(bytes: &[u8], width: usize, height: usize) -> Result<Vec<u16>, DecodeError> {
     let mut reader = open(bytes, width, height, Transformations::IDENTITY)?;
