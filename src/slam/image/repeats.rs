@@ -93,9 +93,14 @@ impl Repeats {
         }
         self.blocks.clear();
         self.blocks.extend_from_slice(blocks);
-        self.changes.rotate_left(1);
-        self.changes[NUM_CHANGES - 1] = change;
         self.near_repeats = 0;
+        // A repeat that was not recognised, as after a rest, would keep the next ones from being so.
+        let last = self.changes[NUM_CHANGES - 1].unwrap_or(0.0);
+        let is_step = |change: f64| change > MAX_CHANGE.min(MAX_CHANGE_RATIO * last);
+        if is_near || change.is_none_or(is_step) {
+            self.changes.rotate_left(1);
+            self.changes[NUM_CHANGES - 1] = change;
+        }
         if is_near { Shown::Rest } else { Shown::New }
     }
 }
@@ -158,6 +163,18 @@ mod tests {
         assert_eq!(shown(&rests, 2.0), noisy);
         let exact = [New, New, Repeat, Repeat, Repeat, Repeat, Repeat, New];
         assert_eq!(shown(&rests, 0.0), exact);
+    }
+
+    #[test]
+    fn after_a_rest_repeats_are_recognised_again() {
+        let doubled = |steps: std::ops::Range<usize>| steps.flat_map(|step| [0.1 * step as f64; 2]);
+        let places: Vec<_> = [0.0; 6].into_iter().chain(doubled(1..7)).collect();
+        let seen = shown(&places, 2.0);
+        assert_eq!(seen[3], Rest);
+        assert_eq!(seen[12..], [New, Repeat].repeat(3), "{seen:?}");
+        let slow: Vec<_> = doubled(0..3).chain([0.201; 2]).chain(doubled(3..9)).collect();
+        let seen = shown(&slow, 0.5);
+        assert_eq!(seen[14..], [New, Repeat].repeat(3), "{seen:?}");
     }
 
     #[test]

@@ -45,7 +45,7 @@ impl FrameCopies {
         self.is_repeat
     }
 
-    /// Whether that image was copied: a frame that was not used, as a lost one, has no copy.
+    /// Whether the current frame repeats an image that was copied: a frame that was not used, as a lost one, has no copy.
     pub(super) fn repeats_copied(&self) -> bool {
         self.is_repeat && self.previous.is_some()
     }
