@@ -101,7 +101,7 @@ class PoseMessage(ctypes.Structure):
         ("keyframe_from_camera", ctypes.c_double * 7),
         # Upper triangle, row-major, of the covariance of the left increment (translation, rotation) of `current_from_keyframe`, keyframe units and radians. Includes the noise of single points, the errors shared by all depth of the keyframe (its `mode_covariance`) and displacements of the whole image (`displacement_px`). Calibrated on simulated and recorded sequences: check the `nees_…` figures of your own recording before fusing it. Excludes the drift of the keyframe itself and of the scale.
         ("covariance", ctypes.c_double * 21),
-        # Upper triangle, row-major, of the covariance of the left increment ξ (translation, rotation) of `map_from_camera`, `exp(ξ) map_from_camera`, map units and radians: `covariance` and the keyframe's `place_covariance`. The increment rotates about the map's origin: a position p errs by ξ_t + ξ_ω × p. Relative to the keyframes that were held fixed in the joint estimate: earlier drift is not included.
+        # Upper triangle, row-major, of the covariance of the left increment ξ (translation, rotation) of `map_from_camera`, `exp(ξ) map_from_camera`, map units and radians: `covariance` and the keyframe's `place_covariance`. The increment rotates about the map's origin: a position p errs by ξ_t + ξ_ω × p. Relative to the first keyframe of the epoch, so that it includes the estimated drift of the map since its start.
         ("map_covariance", ctypes.c_double * 21),
         # As `covariance`, but of the alignment alone, for the mapper. Overconfident by a factor of up to a hundred in standard deviation: never fuse it.
         ("alignment_covariance", ctypes.c_double * 21),

@@ -98,8 +98,7 @@ pub struct Keyframe {
     pub image: Arc<[u8]>,
     /// Covariance of the errors common to all of its depth.
     pub mode_covariance: ModeCovariance,
-    /// Covariance of its pose in the map, relative to the keyframes that were held when it was estimated; zero for the
-    /// first one of an epoch.
+    /// Covariance of its pose in the map, relative to the first keyframe of its epoch, for which it is zero.
     pub place_covariance: KeyframePoseCovariance,
     /// Whether its depth was observed again in the surrounding keyframes, which is done once.
     pub is_refined: bool,

@@ -120,6 +120,11 @@ impl KeyframePoseCovariance {
         self.matrix().diagonal().iter().zip(IGNORANCE).any(|(&variance, bound)| variance >= bound)
     }
 
+    /// With that of an independent error added.
+    pub fn plus(&self, other: &KeyframePoseMatrix) -> Self {
+        Self::bounded(&(self.matrix() + other))
+    }
+
     /// The covariance after the map is transformed by `by`.
     pub fn transported(&self, by: &Sim3) -> Self {
         let by = transport(by);
@@ -164,14 +169,14 @@ impl UncertainPose {
         let map_from_camera = self.map_from_keyframe.transform_pose(keyframe_from_camera);
         let mut by_camera = map_from_camera.adjoint();
         by_camera.fixed_columns_mut::<3>(0).scale_mut(self.map_from_keyframe.scale);
-        let mut sum = self.at(&map_from_camera.translation);
+        let mut sum = self.covariance_at(&map_from_camera.translation);
         let mut pose = sum.fixed_view_mut::<6, 6>(0, 0);
         pose += by_camera * covariance * by_camera.transpose();
         sum
     }
 
     /// The covariance of something at `position` in the map that is exact relative to this keyframe.
-    fn at(&self, position: &Vector3<f64>) -> KeyframePoseMatrix {
+    pub fn covariance_at(&self, position: &Vector3<f64>) -> KeyframePoseMatrix {
         let mut by_place = KeyframePoseMatrix::identity();
         let lever = position - self.map_from_keyframe.rigid.translation;
         by_place.fixed_view_mut::<3, 1>(0, 6).copy_from(&lever);
@@ -186,17 +191,19 @@ impl UncertainPose {
         // A variance at its bound was larger: if only one of two was clipped, or they were clipped elsewhere, their
         // difference is not the uncertainty between them.
         if was.covariance.is_at_bound() {
-            return KeyframePoseCovariance::bounded(&is.at(&position));
+            return KeyframePoseCovariance::bounded(&is.covariance_at(&position));
         }
         // Unknown for a separate reason: its leader does not change that.
         if self.covariance.is_at_bound() {
             return self.covariance;
         }
         let own = self.covariance.matrix();
-        let beyond = own - was.at(&self.map_from_keyframe.rigid.translation);
+        let beyond = own - was.covariance_at(&self.map_from_keyframe.rigid.translation);
         let between = positive_part(&beyond, &deviations(&own));
         let by = transport(&moved);
-        KeyframePoseCovariance::bounded(&(is.at(&position) + by * between * by.transpose()))
+        KeyframePoseCovariance::bounded(
+            &(is.covariance_at(&position) + by * between * by.transpose()),
+        )
     }
 }
 
@@ -389,7 +396,7 @@ mod tests {
             covariance: KeyframePoseCovariance::bounded(&(clipped * 2.0)),
         };
         let position = follower.map_from_keyframe.rigid.translation;
-        let expected = sure.at(&position);
+        let expected = sure.covariance_at(&position);
         let is_as_sure = |follower: &UncertainPose, was: &UncertainPose| {
             let off = follower.following(was, &sure).matrix() - expected;
             off.norm() < 1e-9 * expected.norm()

@@ -13,7 +13,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
-use crate::slam::keyframe_pose_covariance::KeyframePoseCovariance;
+use crate::slam::keyframe_pose_covariance::{KeyframePoseCovariance, UncertainPose};
 use crate::slam::loops::record::LoopRecord;
 use crate::slam::modes::ModeCovariance;
 
@@ -110,6 +110,8 @@ pub struct KeyframeCorrection {
     pub modes: Option<ModeCovariance>,
     /// Covariance of the new pose; `None` transports that of the old one.
     pub place: Option<KeyframePoseCovariance>,
+    /// Of an estimated pose: the part of it that is relative to the keyframes that held it in place.
+    pub relative_place: Option<KeyframePoseCovariance>,
 }
 
 /// A smooth correction of inverse depth: d ← d · exp(offset + per_x X + per_y Y), X and Y the coordinates of the
@@ -133,6 +135,8 @@ pub struct EpochJoin {
     pub into: u32,
     /// Transforms the first one's map into the second one's.
     pub into_from_epoch: Sim3,
+    /// Covariance of its left increment (translation, rotation, log scale).
+    pub covariance: KeyframePoseCovariance,
 }
 
 /// Why a correction is rejected as a whole.
@@ -155,7 +159,30 @@ impl KeyframeCorrection {
     /// A new pose only.
     pub fn of_pose(keyframe_id: u64, map_from_keyframe: Sim3) -> Self {
         let depth = LogPlane::default();
-        Self { keyframe_id, map_from_keyframe, depth, modes: None, place: None }
+        Self {
+            keyframe_id,
+            map_from_keyframe,
+            depth,
+            modes: None,
+            place: None,
+            relative_place: None,
+        }
+    }
+}
+
+impl EpochJoin {
+    /// One without error.
+    pub fn exact(epoch: u32, into: u32, into_from_epoch: Sim3) -> Self {
+        Self { epoch, into, into_from_epoch, covariance: KeyframePoseCovariance::ZERO }
+    }
+
+    /// The place covariance of a keyframe that was moved by it.
+    fn covariance_of(&self, moved: &Keyframe) -> KeyframePoseCovariance {
+        // An increment at the origin is that of a place there.
+        let origin =
+            UncertainPose { map_from_keyframe: Sim3::identity(), covariance: self.covariance };
+        let of_join = origin.covariance_at(&moved.map_from_keyframe.rigid.translation);
+        moved.place_covariance.transported(&self.into_from_epoch).plus(&of_join)
     }
 }
 
@@ -291,9 +318,7 @@ impl Map {
             for keyframe in self.keyframes.iter_mut().filter(|k| k.epoch == join.epoch) {
                 keyframe.epoch = join.into;
                 keyframe.map_from_keyframe = join.into_from_epoch * keyframe.map_from_keyframe;
-                // The join itself is taken to be exact.
-                keyframe.place_covariance =
-                    keyframe.place_covariance.transported(&join.into_from_epoch);
+                keyframe.place_covariance = join.covariance_of(keyframe);
                 keyframe.revision = revision;
             }
         }

@@ -157,7 +157,7 @@ pub struct PoseEstimate {
     pub covariance: [f64; 21],
     /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation) of `map_from_camera`,
     /// map units and radians ([`place_covariance`](crate::slam::keyframe_pose_covariance)): the uncertainty of the
-    /// keyframe's pose plus `covariance`. Relative to the keyframes that were held when it was estimated.
+    /// keyframe's pose plus `covariance`. Relative to the first keyframe of the epoch.
     pub map_covariance: [f64; 21],
     /// Like `covariance`, but of the alignment alone, as if the errors of distant points were independent: too small
     /// for fusion. The mapper weights matches with it.

@@ -18,6 +18,7 @@ mod factors;
 mod feedback;
 pub mod frames;
 pub(crate) mod functional;
+mod holders;
 pub(crate) mod keyframe;
 mod looping;
 pub(crate) mod marginals;
@@ -363,8 +364,9 @@ impl Window {
             return None;
         }
         self.note_agreement(&chosen.members);
+        let most = self.robustness().most_energy;
         let mut found =
-            marginals::marginals(&self.keyframes, &members, &mut self.solver, &self.camera);
+            marginals::marginals(&self.keyframes, &members, &mut self.solver, &self.camera, most);
         // Places are in the unit of the equations; modes are without a unit.
         let restored = unit.and_then(|unit| unit.restore(&mut self.keyframes, members.members));
         if let Some(by) = restored {

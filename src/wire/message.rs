@@ -101,7 +101,7 @@ pub struct PoseMessage {
     /// Upper triangle, row-major, of the covariance of the left increment ξ (translation, rotation) of
     /// `map_from_camera`, `exp(ξ) map_from_camera`, map units and radians: `covariance` and the keyframe's
     /// `place_covariance`. The increment rotates about the map's origin: a position p errs by ξ_t + ξ_ω × p. Relative
-    /// to the keyframes that were held fixed in the joint estimate: earlier drift is not included.
+    /// to the first keyframe of the epoch, so that it includes the estimated drift of the map since its start.
     pub map_covariance: [f64; 21],
     /// As `covariance`, but of the alignment alone, for the mapper. Overconfident by a factor of up to a hundred in
     /// standard deviation: never fuse it.

@@ -103,12 +103,9 @@ impl<'a> Run<'a> {
 
 /// A correction that moves every keyframe of the map by a separate similarity.
 fn moved(map: &Map, move_one: impl Fn(&Sim3) -> Sim3) -> Correction {
-    let keyframes = map.keyframes.iter().map(|keyframe| KeyframeCorrection {
-        keyframe_id: keyframe.keyframe_id,
-        map_from_keyframe: move_one(&keyframe.map_from_keyframe),
-        depth: LogPlane::default(),
-        modes: None,
-        place: None,
+    let keyframes = map.keyframes.iter().map(|keyframe| {
+        let map_from_keyframe = move_one(&keyframe.map_from_keyframe);
+        KeyframeCorrection::of_pose(keyframe.keyframe_id, map_from_keyframe)
     });
     Correction { keyframes: keyframes.collect(), ..Correction::default() }
 }
@@ -329,7 +326,7 @@ fn joined_epochs_are_one() {
     let epochs: Vec<u32> = run.mapper.map().keyframes.iter().map(|k| k.epoch).collect();
     assert_eq!((epochs[0], *epochs.last().unwrap()), (0, 1), "{epochs:?}");
     let into_from_epoch = Sim3::new(SE3::exp(&Vector6::new(0.5, 0.0, 1.0, 0.0, 1.0, 0.0)), 0.7);
-    let join = EpochJoin { epoch: 1, into: 0, into_from_epoch };
+    let join = EpochJoin::exact(1, 0, into_from_epoch);
     let before = run.mapper.keyframe().unwrap().clone();
     run.apply(&Correction { joins: vec![join], ..Correction::default() });
     let after = run.mapper.keyframe().unwrap();
@@ -369,7 +366,7 @@ fn an_invalid_correction_is_refused_as_a_whole() {
     let mut correction = sane.clone();
     correction.keyframes[0].depth.per_x = 1e9;
     assert!(run.mapper.apply(&correction).is_err());
-    let join = EpochJoin { epoch: 0, into: 0, into_from_epoch: Sim3::identity() };
+    let join = EpochJoin::exact(0, 0, Sim3::identity());
     let refused = run.mapper.apply(&Correction { joins: vec![join], ..Correction::default() });
     assert!(matches!(refused.unwrap_err(), CorrectionError::Join(0)));
     for unit in [0.0, -1.0, f64::NAN, f64::INFINITY] {

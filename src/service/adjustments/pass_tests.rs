@@ -74,6 +74,7 @@ fn a_piece_moves_the_map_and_odometry_does_not_jump() {
         depth: LogPlane::default(),
         modes: None,
         place: None,
+        relative_place: None,
     };
     let correction = Correction { keyframes: vec![correction], ..Correction::default() };
     walk.mapper.apply(&correction).unwrap();

@@ -219,6 +219,7 @@ fn an_estimate_of_a_map_that_was_corrected_meanwhile_is_dropped() {
         depth: LogPlane::default(),
         modes: None,
         place: None,
+        relative_place: None,
     };
     let correction = Correction { keyframes: vec![correction], ..Correction::default() };
     walk.mapper.apply(&correction).unwrap();

@@ -97,6 +97,8 @@ mod tests {
         let pairs: Vec<(u64, u64)> = both.links.iter().map(|link| (link.i, link.j)).collect();
         assert_eq!(pairs, [(7, 3), (8, 3), (15, 11), (16, 11)]);
         assert_eq!(both.held_by[&15], [13, 14]);
+        let covariances = &both.relative_covariances;
+        assert!(covariances.keys().eq(&[7, 9, 15, 17]) && covariances[&17] == covariances[&9]);
         assert_eq!((both.beginnings.contains(&12), both.searched_to), (true, Some(16)));
     }
 }

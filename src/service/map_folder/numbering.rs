@@ -111,6 +111,7 @@ mod tests {
         assert_eq!((head.revision, head.free_epoch), (4, 3));
         assert_eq!(head.loops.links, map.loops.links);
         assert_eq!(head.loops.held_by, map.loops.held_by);
+        assert_eq!(head.loops.relative_covariances, map.loops.relative_covariances);
         assert_eq!(head.loops.beginnings, map.loops.beginnings);
     }
 }

@@ -6,6 +6,7 @@
 //! information of its estimate, so each has n times the covariance.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use crate::slam::geometry::sim3::{Matrix7, Sim3};
 use crate::slam::graph::marginal::Marginals;
@@ -20,7 +21,7 @@ use crate::slam::loops::record::Link;
 /// Standard deviations of a link (translation in mean depths, rotation in radians, ln s): the least, whatever an
 /// estimate claims, and those without an estimate. The least are an eighth of a pixel at f = 250 and the uncertainty of
 /// a scale that a thousand points hold; the others those of a step to the next keyframe by the tracker alone.
-const MIN_STD_DEVS: [f64; 3] = [0.0005, 0.0005, 0.001];
+pub(super) const MIN_STD_DEVS: [f64; 3] = [0.0005, 0.0005, 0.001];
 const UNESTIMATED: [f64; 3] = [0.03, 0.02, 0.05];
 
 /// The pose graph of an epoch.
@@ -57,11 +58,9 @@ impl Chain {
             if !is_estimated && !loops.record.beginnings.contains(&node.keyframe_id) {
                 others.push(of_epoch[place - 1]);
             }
-            let covariance = link_covariance(
-                &node.map_from_keyframe,
-                is_estimated.then_some(&node.place_covariance),
-                loops.params.drift_inflation,
-            ) * others.len() as f64;
+            let known = loops.link_covariance(node.keyframe_id).filter(|_| is_estimated);
+            let covariance =
+                known.unwrap_or_else(|| of_deviations(UNESTIMATED)) * others.len() as f64;
             for other in others {
                 let j_from_i = node.map_from_keyframe.inverse() * other.map_from_keyframe;
                 chain.add(other.keyframe_id, node.keyframe_id, j_from_i, &covariance)?;
@@ -115,21 +114,49 @@ impl Predictions {
     }
 }
 
+impl Loops {
+    /// Stores the covariance of an estimated keyframe's pose relative to those that held it, in a map that contains the
+    /// estimate.
+    pub fn note_covariance(
+        &mut self,
+        keyframe_id: u64,
+        map_from_keyframe: &Sim3,
+        relative_place: &KeyframePoseCovariance,
+    ) {
+        if self.is_on() {
+            let covariance = relative_covariance(map_from_keyframe, relative_place);
+            Arc::make_mut(&mut self.record).relative_covariances.insert(keyframe_id, covariance);
+        }
+    }
+
+    /// Covariance of the left increment of a keyframe's pose relative to those it was estimated with; `None` where that
+    /// is not known.
+    pub(super) fn link_covariance(&self, keyframe_id: u64) -> Option<Matrix7> {
+        let known = self.record.relative_covariances.get(&keyframe_id)?;
+        let covariance = known * self.params.drift_inflation + of_deviations(MIN_STD_DEVS);
+        covariance.cholesky().map(|_| covariance)
+    }
+
+    /// Covariances in a map of a version that did not record them: there the place covariance is the relative one.
+    pub(super) fn recorded_before(&self, keyframes: &[Keyframe]) -> BTreeMap<u64, Matrix7> {
+        let estimated =
+            keyframes.iter().filter(|of| self.record.held_by.contains_key(&of.keyframe_id));
+        let relative = |of: &Keyframe| {
+            (of.keyframe_id, relative_covariance(&of.map_from_keyframe, &of.place_covariance))
+        };
+        estimated.map(relative).collect()
+    }
+}
+
 /// Covariance of the left increment of `newer_from_older` from that of the newer one's pose.
-pub(super) fn link_covariance(
-    map_from_newer: &Sim3,
-    place: Option<&KeyframePoseCovariance>,
-    inflation: f64,
-) -> Matrix7 {
-    let of_deviations = |[translation, rotation, scale]: [f64; 3]| {
-        let (t, r) = (translation * translation, rotation * rotation);
-        Matrix7::from_diagonal(&[t, t, t, r, r, r, scale * scale].into())
-    };
-    let unestimated = of_deviations(UNESTIMATED);
-    let Some(place) = place else { return unestimated };
+fn relative_covariance(map_from_newer: &Sim3, place: &KeyframePoseCovariance) -> Matrix7 {
     let mut by_errors = map_from_newer.inverse().adjoint();
     by_errors.fixed_view_mut::<7, 1>(0, 6).fill(0.0);
     by_errors[(6, 6)] = 1.0;
-    let covariance = by_errors * place.matrix() * by_errors.transpose() * inflation;
-    covariance + of_deviations(MIN_STD_DEVS)
+    by_errors * place.matrix() * by_errors.transpose()
+}
+
+pub(super) fn of_deviations([translation, rotation, scale]: [f64; 3]) -> Matrix7 {
+    let (t, r) = (translation * translation, rotation * rotation);
+    Matrix7::from_diagonal(&[t, t, t, r, r, r, scale * scale].into())
 }

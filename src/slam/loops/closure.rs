@@ -2,9 +2,12 @@
 
 use std::sync::Arc;
 
-use crate::slam::geometry::sim3::Sim3;
+use nalgebra::Vector3;
+
+use crate::slam::geometry::sim3::{Matrix7, Sim3};
 use crate::slam::graph::{GraphParams, optimise};
 use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::keyframe_pose_covariance::KeyframePoseCovariance;
 use crate::slam::loops::chain::Chain;
 use crate::slam::loops::record::Link;
 use crate::slam::loops::search::LARGEST_CHI2;
@@ -76,9 +79,10 @@ impl Loops {
         let into_from_epoch =
             older.map_from_keyframe * older_from_newer * newer.map_from_keyframe.inverse();
         let (epoch, into) = (newer.epoch, older.epoch);
+        let covariance = join_covariance(link, older, newer, &into_from_epoch);
         let beginning = job.nodes.iter().find(|node| node.epoch == epoch);
         Arc::make_mut(&mut self.record).beginnings.extend(beginning.map(|node| node.keyframe_id));
-        let join = Some(EpochJoin { epoch, into, into_from_epoch });
+        let join = Some(EpochJoin { epoch, into, into_from_epoch, covariance });
         self.closure = Some(Closure { epoch, moves: Vec::new(), join });
         SearchOutcome::Joined
     }
@@ -105,5 +109,88 @@ impl Loops {
         let moves = chain.ids.iter().copied().zip(by).collect();
         self.closure = Some(Closure { epoch, moves, join: None });
         SearchOutcome::Closed
+    }
+}
+
+/// Covariance of the left increment of `into_from_epoch`, which a link between two keyframes gives: that of the link,
+/// and those of the keyframes in their epochs.
+fn join_covariance(
+    link: &Link,
+    older: &Keyframe,
+    newer: &Keyframe,
+    into_from_epoch: &Sim3,
+) -> KeyframePoseCovariance {
+    let along = |by: &Sim3, covariance: &Matrix7| {
+        let adjoint = by.adjoint();
+        adjoint * covariance * adjoint.transpose()
+    };
+    // Of the left increment of a keyframe's similarity: its errors at the origin.
+    let of_keyframe = |of: &Keyframe| of.uncertain_pose().covariance_at(&Vector3::zeros());
+    let older_from_j = match link.j == older.keyframe_id {
+        true => Sim3::identity(),
+        false => link.j_from_i.inverse(),
+    };
+    KeyframePoseCovariance::bounded(
+        &(of_keyframe(older)
+            + along(&(older.map_from_keyframe * older_from_j), &link.covariance)
+            + along(into_from_epoch, &of_keyframe(newer))),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Twist7;
+    use crate::slam::test_scene::Scene;
+
+    /// Small enough for products of errors to vanish.
+    const STEP: f64 = 1e-6;
+
+    fn similarity(salt: f64) -> Sim3 {
+        Sim3::exp(&Twist7::from_fn(|row, _| 0.4 * (salt + 1.7 * row as f64).sin()))
+    }
+
+    fn errors(salt: f64) -> Twist7 {
+        Twist7::from_fn(|row, _| (salt + 1.3 * row as f64).sin())
+    }
+
+    /// A keyframe with this error of its pose and unit, and the covariance of that error alone.
+    fn keyframe(epoch: u32, exact: &Sim3, error: &Twist7) -> Keyframe {
+        let pose = SE3::exp(&(error.fixed_rows::<6>(0) * STEP));
+        let map_from_keyframe =
+            Sim3::new(pose * exact.rigid, exact.scale * (error[6] * STEP).exp());
+        let place_covariance = KeyframePoseCovariance::bounded(&(error * error.transpose()));
+        let id = u64::from(epoch);
+        let keyframe = Scene::new(1).keyframe(id, SE3::identity(), 1.0);
+        Keyframe { epoch, map_from_keyframe, place_covariance, ..keyframe }
+    }
+
+    #[test]
+    fn a_join_errs_as_its_link_and_both_keyframes_do() {
+        for newer_is_i in [true, false] {
+            let [older, newer, join] = [0.3, 1.1, 2.0].map(similarity);
+            let j_from_i = match newer_is_i {
+                true => older.inverse() * join * newer,
+                false => newer.inverse() * join.inverse() * older,
+            };
+            for part in 0..3 {
+                let [of_older, of_newer, of_link] =
+                    [0, 1, 2].map(|of| errors(0.7) * f64::from(u8::from(of == part)));
+                let (older, newer) =
+                    (keyframe(0, &older, &of_older), keyframe(1, &newer, &of_newer));
+                let [i, j] = if newer_is_i { [1, 0] } else { [0, 1] };
+                let j_from_i = Sim3::exp(&(of_link * STEP)) * j_from_i;
+                let link = Link { i, j, j_from_i, covariance: of_link * of_link.transpose() };
+                let older_from_newer = if newer_is_i { j_from_i } else { j_from_i.inverse() };
+                let found =
+                    older.map_from_keyframe * older_from_newer * newer.map_from_keyframe.inverse();
+                let error = (found * join.inverse()).log() / STEP;
+                let expected = error * error.transpose();
+                let covariance = join_covariance(&link, &older, &newer, &join).matrix();
+                let off = (covariance - expected).norm();
+                assert!(error.norm() > 0.1 && off < 1e-4 * expected.norm(), "{part}: {off}");
+            }
+        }
     }
 }

@@ -26,6 +26,8 @@ pub struct LoopRecord {
     pub links: Vec<Link>,
     /// By keyframe: the older ones that its pose was estimated against.
     pub held_by: BTreeMap<u64, Vec<u64>>,
+    /// By keyframe: covariance of the left increment of its pose relative to those, in its unit.
+    pub relative_covariances: BTreeMap<u64, Matrix7>,
     /// Keyframes without a link to the one before: the first of epochs that were joined to others.
     pub beginnings: BTreeSet<u64>,
     /// All keyframes up to this one have been searched.
@@ -57,6 +59,8 @@ impl LoopRecord {
         self.links.extend(links);
         let held = second.held_by.iter();
         self.held_by.extend(held.map(|(id, by)| (moved(id), by.iter().map(moved).collect())));
+        let covariances = second.relative_covariances.iter();
+        self.relative_covariances.extend(covariances.map(|(id, of)| (moved(id), *of)));
         self.beginnings.extend(second.beginnings.iter().map(moved));
         self.searched_to = second.searched_to.as_ref().map(moved).or(self.searched_to);
         self
@@ -72,6 +76,10 @@ impl LoopRecord {
         Self {
             links: self.links.iter().filter_map(link).collect(),
             held_by: self.held_by.iter().filter_map(held).collect(),
+            relative_covariances: {
+                let of_id = |(&id, &of): (&u64, &Matrix7)| Some((moved(id)?, of));
+                self.relative_covariances.iter().filter_map(of_id).collect()
+            },
             beginnings: self.beginnings.iter().copied().filter_map(moved).collect(),
             searched_to: self.searched_to.and_then(moved),
         }

@@ -3,7 +3,7 @@
 
 use crate::slam::geometry::sim3::{Matrix7, Sim3, Twist7};
 use crate::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Refusal, Start};
-use crate::slam::loops::chain::{Chain, link_covariance};
+use crate::slam::loops::chain::{Chain, MIN_STD_DEVS, of_deviations};
 use crate::slam::loops::record::Link;
 use crate::slam::loops::{Job, Loops, Pair, Plan, SearchOutcome, Stage, confirmations};
 
@@ -109,15 +109,9 @@ impl Loops {
             let adjoint = by.adjoint();
             adjoint * covariance * adjoint.transpose()
         };
-        let of_link = |id| {
-            let node = job.node(id)?;
-            let inflation = self.params.drift_inflation;
-            Some(link_covariance(&node.map_from_keyframe, Some(&node.place_covariance), inflation))
-        };
-        let (Some(of_near_i), Some(of_near_j)) = (of_link(confirmation.i), of_link(confirmation.j))
-        else {
-            return false;
-        };
+        // The first one of an epoch has no error.
+        let of_link = |id| self.link_covariance(id).unwrap_or_else(|| of_deviations(MIN_STD_DEVS));
+        let (of_near_i, of_near_j) = (of_link(confirmation.i), of_link(confirmation.j));
         let covariance = confirmation.covariance
             + along(&near_j_from_j, &link.covariance)
             + of_near_j

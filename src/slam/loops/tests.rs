@@ -31,6 +31,9 @@ fn round() -> Vec<SE3> {
     (0..15).map(at).collect()
 }
 
+/// Variance of a keyframe's place in the map.
+const IN_MAP: f64 = 0.2;
+
 /// A map of keyframes with the drift of a chain, in which each was estimated against the one before it.
 struct Course {
     map: Map,
@@ -60,12 +63,16 @@ impl Course {
                 error = error * about * Sim3::exp(&step) * about.inverse();
                 loops.note_estimate(id, &[id - 1], &[]);
             }
-            let keyframe = Keyframe {
-                keyframe_id: id,
-                map_from_keyframe: error * Sim3::new(place, image.map_from_keyframe.scale),
-                place_covariance: KeyframePoseCovariance::bounded(&covariance),
-                ..image
-            };
+            let map_from_keyframe = error * Sim3::new(place, image.map_from_keyframe.scale);
+            if id > 0 {
+                let relative = KeyframePoseCovariance::bounded(&covariance);
+                loops.note_covariance(id, &map_from_keyframe, &relative);
+            }
+            // Of no account for links: these have covariances of their own.
+            let in_map = KeyframePoseMatrix::identity() * if id == 0 { 0.0 } else { IN_MAP };
+            let place_covariance = KeyframePoseCovariance::bounded(&in_map);
+            let keyframe =
+                Keyframe { keyframe_id: id, map_from_keyframe, place_covariance, ..image };
             let Intrinsics { width, height, .. } = keyframe.intrinsics;
             let description = Describer::default().describe(&keyframe.image, width, height);
             map.keyframes.push(Keyframe { description: description.map(Arc::new), ..keyframe });
@@ -240,6 +247,9 @@ fn two_epochs_that_see_the_same_become_one() {
     let truth = places[4];
     assert!((last.rigid.translation - truth.translation).norm() < 0.03, "{last:?} {into_epoch:?}");
     assert!((last.scale / UNIT).ln().abs() < 0.02, "{last:?}");
+    // Its own, those of both keyframes that the epochs are joined by, of which the older may be exact, and the link's.
+    let of_unit = course.map.keyframes.last().unwrap().place_covariance.matrix()[(6, 6)];
+    assert!((2.0 * IN_MAP..3.1 * IN_MAP).contains(&of_unit), "{of_unit}");
 }
 
 #[test]

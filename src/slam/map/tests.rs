@@ -50,19 +50,14 @@ fn the_covariance_of_a_pose_moves_with_it_unless_a_correction_gives_one() {
     let by = Sim3::new(SE3::exp(&Vector6::new(1.0, -2.0, 0.5, 0.3, 0.2, -0.4)), 2.5);
     let corrected = |place, unit| {
         let mut map = Map { keyframes: vec![uncertain.clone()], ..Map::default() };
-        let corrected = KeyframeCorrection {
-            keyframe_id: 1,
-            map_from_keyframe: by * uncertain.map_from_keyframe,
-            depth: LogPlane::default(),
-            modes: None,
-            place,
-        };
+        let moved = by * uncertain.map_from_keyframe;
+        let corrected = KeyframeCorrection { place, ..KeyframeCorrection::of_pose(1, moved) };
         let correction = Correction { keyframes: vec![corrected], joins: Vec::new(), unit };
         map.correct(&correction, 7).unwrap();
         map.keyframes[0].place_covariance
     };
     let mut joined = Map { keyframes: vec![uncertain.clone()], ..Map::default() };
-    let join = EpochJoin { epoch: 0, into: 3, into_from_epoch: by };
+    let join = EpochJoin::exact(0, 3, by);
     joined.correct(&Correction { joins: vec![join], ..Correction::default() }, 7).unwrap();
     // For a keyframe at the map's origin: lengths in the new unit, and about the new origin.
     let expected = uncertain.place_covariance.transported(&by).matrix();
@@ -87,4 +82,22 @@ fn a_keyframe_is_found_in_any_order() {
         }
         assert_eq!(map.index_of(5), None);
     }
+}
+
+#[test]
+fn keyframes_of_a_joined_epoch_have_the_error_of_the_join_at_their_places() {
+    const STEP: f64 = 1e-6;
+    let by = Sim3::new(SE3::exp(&Vector6::new(1.0, -2.0, 0.5, 0.3, 0.2, -0.4)), 2.5);
+    let error = Vector6::new(0.3, -0.2, 0.5, 0.7, -0.4, 0.6).push(-0.8);
+    let covariance = KeyframePoseCovariance::bounded(&(error * error.transpose()));
+    let mut at = keyframe(1);
+    at.map_from_keyframe = Sim3::new(SE3::exp(&Vector6::new(0.5, 3.0, -1.0, 0.2, 0.0, 0.4)), 1.5);
+    let mut map = Map { keyframes: vec![at.clone()], ..Map::default() };
+    let join = EpochJoin { epoch: 0, into: 3, into_from_epoch: by, covariance };
+    map.correct(&Correction { joins: vec![join], ..Correction::default() }, 7).unwrap();
+    let [exact, found] = [by, Sim3::exp(&(error * STEP)) * by].map(|by| by * at.map_from_keyframe);
+    let pose = (found.rigid * exact.rigid.inverse()).log() / STEP;
+    let expected = pose.push((found.scale / exact.scale).ln() / STEP);
+    let found = map.keyframes[0].place_covariance.matrix();
+    assert!((found - expected * expected.transpose()).norm() < 1e-4 * found.norm(), "{found}");
 }

@@ -164,7 +164,7 @@ mod tests {
         for of_active in [0, 1] {
             let mut mapper = mapper();
             mapper.map.keyframes[1].epoch = of_active;
-            let join = EpochJoin { epoch: 1, into: 0, into_from_epoch: Sim3::identity() };
+            let join = EpochJoin::exact(1, 0, Sim3::identity());
             let closure = Closure { epoch: 0, moves: Vec::new(), join: Some(join) };
             let outcome = mapper.close_loop(&closure, &mut window());
             assert_eq!(mapper.keyframe().unwrap().epoch, 0);
@@ -233,7 +233,7 @@ mod tests {
         let mut mapper = mapper();
         mapper.map.keyframes[1].epoch = 4;
         let into_from_epoch = Sim3::new(sideways(-3.0), 0.5);
-        let join = Some(EpochJoin { epoch: 4, into: 0, into_from_epoch });
+        let join = Some(EpochJoin::exact(4, 0, into_from_epoch));
         let outcome =
             mapper.close_loop(&Closure { epoch: 4, moves: Vec::new(), join }, &mut window());
         assert!(outcome.graph_changed && outcome.keyframe_changed);

@@ -98,7 +98,10 @@ impl Mapper {
             window.request_pass_on_jump(&self.map, &correction);
             // The values are checked: invalid ones leave the map unchanged.
             match self.apply(&correction) {
-                Ok(applied) => outcome = applied,
+                Ok(applied) => {
+                    outcome = applied;
+                    window.record_covariances(&correction);
+                }
                 Err(_) => window.discard_refinement(),
             }
         }
@@ -300,6 +303,43 @@ fn push_bounded(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::slam::keyframe_pose_covariance::{KeyframePoseCovariance, KeyframePoseMatrix};
+    use crate::slam::mapper::MapperParams;
+    use crate::slam::mapper::phase::Active;
+    use crate::slam::test_scene::{CAMERA, Scene};
+
+    #[test]
+    fn an_estimate_gives_places_in_the_map_and_the_search_those_relative_to_others() {
+        let sideways = |x: f64| SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
+        let scene = Scene::new(3);
+        let estimated = |of_first: f64| {
+            let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+            let places = (0..).zip([0.0, 0.15, 0.3, 0.4]);
+            mapper.map.keyframes =
+                places.map(|(id, x)| scene.keyframe(id, sideways(x), 1.0)).collect();
+            let of_first = KeyframePoseMatrix::identity() * of_first;
+            mapper.map.keyframes[0].place_covariance = KeyframePoseCovariance::bounded(&of_first);
+            mapper.active = Some(Active::new(3));
+            let mut window = mapper.begin_adjustment(false).unwrap();
+            window.optimise().unwrap();
+            mapper.end_adjustment(window);
+            mapper.map
+        };
+        let [exact, uncertain] = [0.0, 0.01].map(estimated);
+        let relative = &exact.loops.relative_covariances;
+        assert!(relative.keys().eq(&[1, 2, 3]), "{relative:?}");
+        assert_eq!(relative, &uncertain.loops.relative_covariances);
+        for (one, other) in exact.keyframes.iter().zip(&uncertain.keyframes).skip(1) {
+            let [one_place, other] = [one, other].map(|of| of.place_covariance.matrix());
+            let by_first = other - one_place;
+            for at in [(1, 1), (4, 4), (6, 6)] {
+                assert!((by_first[at] - 0.01).abs() < 1e-6, "{by_first}");
+            }
+            // The first keyframe is at the origin and its unit 1.
+            let relative = relative[&one.keyframe_id];
+            assert!(one_place[(6, 6)] > 0.0 && relative[(6, 6)] == one_place[(6, 6)]);
+        }
+    }
 
     /// Early frames of at most `most` images: each a sequence and an image.
     fn early(sent: &[(u64, usize)], most: usize) -> Vec<TrackedFrame> {

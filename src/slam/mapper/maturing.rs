@@ -191,6 +191,7 @@ mod tests {
             depth: LogPlane { offset: 2f64.ln(), ..LogPlane::default() },
             modes: None,
             place: None,
+            relative_place: None,
         };
         for (keyframe_id, factor) in [(KEYFRAME + 1, 1.0), (KEYFRAME, 2.0)] {
             let keyframes = vec![doubled(keyframe_id)];

@@ -159,7 +159,8 @@ impl Mapper {
             return false;
         }
         let found = known.map_from_keyframe.transform_pose(at).rotation;
-        let uncertain = rotation_std_dev(&full_covariance(&pose.map_covariance));
+        // Without the drift of the map, which the limit contains.
+        let uncertain = rotation_std_dev(&full_covariance(&pose.covariance));
         found.angle_to(&pose.map_from_camera.rotation)
             > MAX_DRIFT_RAD + MAX_POSE_DEVIATIONS * uncertain
     }

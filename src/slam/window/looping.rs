@@ -2,7 +2,7 @@
 
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::loops::{Closure, LoopParams, Loops};
-use crate::slam::map::Map;
+use crate::slam::map::{Correction, Map};
 use crate::slam::window::Window;
 use crate::slam::window::members::{Chosen, MIN_COMMON};
 
@@ -68,6 +68,14 @@ impl Window {
             counts[other] += self.solver.system.inliers_among(pair.places(), most_energy);
         }
         counts
+    }
+
+    /// Records for the search the covariances of a correction that the map contains.
+    pub fn record_covariances(&mut self, correction: &Correction) {
+        for of in &correction.keyframes {
+            let Some(relative) = &of.relative_place else { continue };
+            self.loops.note_covariance(of.keyframe_id, &of.map_from_keyframe, relative);
+        }
     }
 
     pub(super) fn num_unsettled(&self) -> usize {

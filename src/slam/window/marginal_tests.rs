@@ -166,3 +166,20 @@ fn uncertainties_of_places_are_relative_to_the_unit_that_is_kept() {
         }
     }
 }
+
+#[test]
+fn keyframes_that_hold_others_share_by_their_comparisons() {
+    let mut room = noisy_room(|_, _| (1.0, 0.0), 1);
+    room.held = vec![0, 1];
+    // Half of the points of one of them are gone.
+    let half = room.keyframes[0].points.len() / 2;
+    room.keyframes[0].points.truncate(half);
+    let (_, marginals) = room.solve_with(&mut Solver::default());
+    assert_eq!(marginals.len(), 2);
+    for of in &marginals {
+        let [first, second] = &of.held_by[..] else { panic!("{of:?}") };
+        assert_eq!([first.keyframe_id, second.keyframe_id], [0, 1]);
+        assert!((first.share + second.share - 1.0).abs() < 1e-12, "{of:?}");
+        assert!((0.15..0.48).contains(&first.share), "{of:?}");
+    }
+}

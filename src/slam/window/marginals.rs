@@ -25,6 +25,7 @@ use crate::slam::modes::NUM_MODES;
 use crate::slam::window::Window;
 use crate::slam::window::comparison::{POSE, Pair};
 use crate::slam::window::functional::{Functional, Seen};
+use crate::slam::window::holders::{Comparisons, Holder, holders};
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint};
 use crate::slam::window::place_marginals::{
     Gauge, KeyframePoseMarginal, covariance_of_displacement, unit_fit,
@@ -35,7 +36,7 @@ use crate::slam::window::view::{MIN_DEPTH_RATIO, ObserverView, Views};
 
 /// Uncertainty of a jointly estimated keyframe, from the noise of the residuals alone: these are taken as independent,
 /// and the keyframes that hold the others in place as exact, which makes it overconfident.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Marginal {
     /// The keyframe.
     pub keyframe_id: u64,
@@ -46,6 +47,8 @@ pub struct Marginal {
     pub of_displaced: Matrix3<f64>,
     /// Its place; `None` where one keyframe alone holds the others and has no depth to hold their unit.
     pub place: Option<KeyframePoseMarginal>,
+    /// The older keyframes that held it in place.
+    pub held_by: Vec<Holder>,
 }
 
 /// Points that a fit of the modes needs: ten per parameter, as the plane.
@@ -68,7 +71,9 @@ pub(super) fn marginals(
     members: &Members<'_>,
     solver: &mut Solver,
     camera: &Intrinsics,
+    most_energy: f32,
 ) -> Vec<Marginal> {
+    let mut held_by = holders_of(keyframes, members, solver, most_energy);
     let (views, system) = (&solver.views, &mut solver.system);
     // The unit that nothing holds is not one of the modes: any stiffness serves. From places it is removed.
     let unit = unit_direction(keyframes, members, system.num_free);
@@ -99,11 +104,28 @@ pub(super) fn marginals(
         });
         let place = place.filter(KeyframePoseMarginal::is_finite);
         let keyframe_id = keyframe.keyframe_id;
-        Some(Marginal { keyframe_id, modes, of_displaced: of_one / parallax, place })
+        let (of_displaced, held_by) = (of_one / parallax, std::mem::take(&mut held_by[member]));
+        Some(Marginal { keyframe_id, modes, of_displaced, place, held_by })
     });
     let is_finite =
         |of: &Marginal| of.modes.iter().chain(of.of_displaced.iter()).all(|x| x.is_finite());
     marginals.filter(is_finite).collect()
+}
+
+/// For each member, the keyframes that hold it.
+fn holders_of(
+    keyframes: &[WindowKeyframe],
+    members: &Members<'_>,
+    solver: &Solver,
+    most_energy: f32,
+) -> Vec<Vec<Holder>> {
+    let ids: Vec<u64> = members.members.iter().map(|&at| keyframes[at].keyframe_id).collect();
+    let is_free: Vec<bool> = members.free.iter().map(Option::is_some).collect();
+    let comparisons = solver.views.pairs.iter().map(|pair| Comparisons {
+        members: [pair.host, pair.observer],
+        inliers: solver.system.inliers_among(pair.places(), most_energy),
+    });
+    holders(&ids, &is_free, &comparisons.collect::<Vec<_>>())
 }
 
 /// Motion of the free poses as the unit grows of a window that only one keyframe holds in place; `None` where more do.

@@ -121,7 +121,7 @@ impl Window {
         let corrected = correction.keyframes.iter().find(|of| of.keyframe_id == id);
         let (Some(was), Some(is)) = (map.get(id), corrected) else { return };
         let unit = (is.map_from_keyframe.scale / was.map_from_keyframe.scale).ln();
-        let of_unit = is.place.map(|place| place.matrix()[(6, 6)].sqrt());
+        let of_unit = is.relative_place.map(|place| place.matrix()[(6, 6)].sqrt());
         let of_tilt = is.modes.map(|modes| modes.std_devs());
         let jumps = [
             (unit, of_unit),

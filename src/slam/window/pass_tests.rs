@@ -7,7 +7,7 @@ use nalgebra::{Matrix3, Vector6};
 use super::tests::{exact_host, in_map};
 use super::*;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::keyframe_pose_covariance::KeyframePoseCovariance;
+use crate::slam::keyframe_pose_covariance::{KeyframePoseCovariance, KeyframePoseMatrix};
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
 use crate::slam::modes::ModeCovariance;
 use crate::slam::test_scene::{CAMERA, Scene};
@@ -145,7 +145,12 @@ fn a_jump_of_the_newest_plane_or_unit_beyond_its_sigma_calls_for_a_pass() {
         keyframes: (0..KEYFRAMES as u64).map(|id| in_map(id, 0, 0.1 * id as f64, 1.0)).collect(),
         ..Map::default()
     };
-    let begins = |unit: f64, per_x: f64, std_dev: f64| {
+    let of_unit = |std_dev: f64| {
+        let mut matrix = KeyframePoseMatrix::zeros();
+        matrix[(6, 6)] = std_dev * std_dev;
+        Some(KeyframePoseCovariance::bounded(&matrix))
+    };
+    let begins_with = |unit: f64, per_x: f64, std_dev: f64, relative_place| {
         let mut window = walk();
         window.pass.added = 0;
         let mut map_from_keyframe = map.keyframes[9].map_from_keyframe;
@@ -155,7 +160,9 @@ fn a_jump_of_the_newest_plane_or_unit_beyond_its_sigma_calls_for_a_pass() {
             map_from_keyframe,
             depth: LogPlane { per_x, ..LogPlane::default() },
             modes: Some(ModeCovariance::of_std_devs([std_dev; 3])),
-            place: None,
+            // Drift of the map is no excuse for a jump.
+            place: of_unit(0.5),
+            relative_place,
         };
         window.request_pass_on_jump(
             &map,
@@ -163,6 +170,10 @@ fn a_jump_of_the_newest_plane_or_unit_beyond_its_sigma_calls_for_a_pass() {
         );
         window.begin_piece()
     };
+    let begins =
+        |unit: f64, per_x: f64, std_dev: f64| begins_with(unit, per_x, std_dev, of_unit(0.01));
+    assert!(begins_with(0.15, 0.0, 0.01, None));
+    assert!(!begins_with(0.15, 0.0, 0.01, of_unit(0.05)), "three sigma of the unit");
     assert!(begins(0.15, 0.0, 0.01) && begins(-0.15, 0.0, 0.01));
     assert!(begins(0.0, 0.15, 0.01) && begins(0.0, -0.15, 0.01));
     assert!(!begins(0.05, 0.05, 0.001), "as recordings wander");

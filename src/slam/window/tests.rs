@@ -1,8 +1,9 @@
 //! Windows of a rendered room solved from a perturbed truth, and their corrections of the map.
 
-use nalgebra::{Matrix3, Vector6};
+use nalgebra::Vector6;
 
 use super::comparison::Robustness;
+use super::feedback::tests::marginal;
 use super::solver::Solver;
 use super::*;
 use crate::slam::geometry::se3::SE3;
@@ -148,7 +149,16 @@ impl Room {
             assert!(solver.adjust(&mut self.keyframes, &members, &at, 15, 1e-4));
         }
         let inlier_ratio = solver.system.inliers as f64 / solver.system.compared as f64;
-        (inlier_ratio, marginals::marginals(&self.keyframes, &members, solver, &CAMERA))
+        (
+            inlier_ratio,
+            marginals::marginals(
+                &self.keyframes,
+                &members,
+                solver,
+                &CAMERA,
+                robustness.most_energy,
+            ),
+        )
     }
 
     /// Largest error of a pose relative to the first (translation over the baseline, rotation in degrees), and the
@@ -440,10 +450,7 @@ fn keyframes_that_are_not_estimated_follow_the_last_moved_one_before_them() {
         .map(|of| KeyframePoseCovariance::bounded(&(KeyframePoseMatrix::identity() * of)));
     map.keyframes[3].points = depth;
     map.keyframes[4].place_covariance = own;
-    let none = Matrix3::zeros();
-    let said_nothing =
-        |keyframe_id| Marginal { keyframe_id, modes: none, of_displaced: none, place: None };
-    window.marginals.extend([3, 5].map(said_nothing));
+    window.marginals.push(marginal(5, &[(3, 1.0)]));
     let correction = window.correction(&map, |_| (ModeCovariance::ZERO, Some(said)));
     let mut moved: Vec<_> = correction.keyframes.iter().map(|of| of.keyframe_id).collect();
     moved.sort_unstable();

@@ -22,7 +22,7 @@ fn a_pose_that_is_rotated_against_a_held_one_is_not_accepted() {
         state,
         keyframe_id: 0,
         map_from_camera: turned(angle),
-        map_covariance: upper_triangle(|row, column| match row == column {
+        covariance: upper_triangle(|row, column| match row == column {
             true => deviation * deviation,
             false => 0.0,
         }),
@@ -144,6 +144,7 @@ fn a_correction_right_after_relocalisation_keeps_the_odometry_pose() {
             depth: LogPlane::default(),
             modes: None,
             place: None,
+            relative_place: None,
         }],
         ..Correction::default()
     };
