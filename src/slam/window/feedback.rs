@@ -237,7 +237,7 @@ pub(super) mod tests {
     fn the_errors_of_keyframes_that_hold_others_add_to_those_of_the_others() {
         let mut window = Window::new(CAMERA, WindowParams::default());
         let mut map = Map::default();
-        let image: Arc<[u8]> = vec![1; (CAMERA.width * CAMERA.height) as usize].into();
+        let image: Arc<[u8]> = vec![1; CAMERA.width * CAMERA.height].into();
         for id in 0..4 {
             let image = Arc::clone(&image);
             map.keyframes.push(Keyframe { image, ..in_map(id, 0, id as f64, 1.0) });
