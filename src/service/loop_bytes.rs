@@ -1,11 +1,14 @@
-//! The loops of a map as bytes, little-endian, in its manifest and in a checkpoint.
+//! The loops of a map as bytes, little-endian, in its manifest and in a checkpoint, in two parts.
 //!
-//! Layout: the word `loops v2`; number of loops (u64), each: keyframes i and j (u64), `j_from_i` (8 × f64), covariance of its left increment
+//! Loops: number of loops (u64), each: keyframes i and j (u64), `j_from_i` (8 × f64), covariance of its left increment
 //! (upper triangle, 28 × f64); number of keyframes with a record of those they were estimated against (u64), each:
 //! keyframe (u64), number (u32) and ids (u64) of the others; number of first keyframes of joined epochs (u64), these
-//! (u64); the last keyframe that was searched (u64, all bits set where none was); number of keyframes with the covariance
-//! of their poses relative to those they were estimated against (u64), each: keyframe (u64), upper triangle (28 × f64).
-//! Before version 2 both the word and these covariances were missing.
+//! (u64); the last keyframe that was searched (u64, all bits set where none was).
+//!
+//! Covariances of keyframes relative to those that they were estimated against, in maps since these are stored: their
+//! number (u64), each: keyframe (u64), upper triangle (28 × f64).
+
+use std::collections::BTreeMap;
 
 use zerocopy::{FromBytes, IntoBytes};
 
@@ -17,12 +20,12 @@ use crate::wire::conversion::{similarity_from_message, similarity_message};
 
 /// Most bytes of the loops of the largest map.
 pub const MAX_LOOP_BYTES: u64 = 64 << 20;
-/// First bytes; before version 2 the number of loops, which is never as large.
-const VERSION_2: [u8; 8] = *b"loops v2";
 /// Bytes of a loop.
 const LINK_BYTES: usize = 8 * (2 + 8 + 28);
 /// Side of the covariance of a similarity.
 const SIDE: usize = 7;
+/// Bytes of a keyframe's covariance.
+const COVARIANCE_BYTES: usize = 8 * (1 + 28);
 /// Smallest eigenvalue of a covariance, as a share of the largest, that rounding may leave.
 const ROUNDING: f64 = 1e-9;
 
@@ -35,15 +38,14 @@ pub enum LoopBytesError {
     /// A number is invalid.
     #[error("loop {0} is not a measurement between two keyframes")]
     Link(usize),
-    /// The same of a covariance.
+    /// A covariance is invalid.
     #[error("the covariance of keyframe {0} relative to those it was estimated with is invalid")]
     Covariance(u64),
 }
 
-/// The bytes of `loops`.
+/// The bytes of `loops`, without the covariances of keyframes.
 pub fn loop_bytes(loops: &LoopRecord) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(64 + LINK_BYTES * loops.links.len());
-    bytes.extend(VERSION_2);
     bytes.extend((loops.links.len() as u64).to_le_bytes());
     for link in &loops.links {
         bytes.extend([link.i, link.j].as_bytes());
@@ -59,18 +61,11 @@ pub fn loop_bytes(loops: &LoopRecord) -> Vec<u8> {
     bytes.extend((loops.beginnings.len() as u64).to_le_bytes());
     loops.beginnings.iter().for_each(|id| bytes.extend(id.to_le_bytes()));
     bytes.extend(loops.searched_to.unwrap_or(NO_KEYFRAME).to_le_bytes());
-    bytes.extend((loops.relative_covariances.len() as u64).to_le_bytes());
-    for (keyframe_id, covariance) in &loops.relative_covariances {
-        bytes.extend(keyframe_id.to_le_bytes());
-        bytes.extend(upper_triangle().flat_map(|at| covariance[at].to_le_bytes()));
-    }
     bytes
 }
 
 /// Parses [`loop_bytes`] and checks every number.
 pub fn parse_loops(mut bytes: &[u8]) -> Result<LoopRecord, LoopBytesError> {
-    let is_version_2 = bytes.starts_with(&VERSION_2);
-    bytes = bytes.strip_prefix(&VERSION_2).unwrap_or(bytes);
     let bytes = &mut bytes;
     let mut loops = LoopRecord::default();
     for index in 0..count(bytes, LINK_BYTES)? {
@@ -95,15 +90,42 @@ pub fn parse_loops(mut bytes: &[u8]) -> Result<LoopRecord, LoopBytesError> {
         loops.beginnings.insert(take(bytes)?);
     }
     loops.searched_to = Some(take(bytes)?).filter(|id| *id != NO_KEYFRAME);
-    let num_covariances = if is_version_2 { count(bytes, 8 * (1 + 28))? } else { 0 };
-    for _ in 0..num_covariances {
+    if bytes.is_empty() { Ok(loops) } else { Err(LoopBytesError::Length) }
+}
+
+/// The bytes of the covariances of keyframes.
+pub fn covariance_bytes(loops: &LoopRecord) -> Vec<u8> {
+    let covariances = &loops.relative_covariances;
+    let mut bytes = Vec::with_capacity(8 + COVARIANCE_BYTES * covariances.len());
+    bytes.extend((covariances.len() as u64).to_le_bytes());
+    for (keyframe_id, covariance) in covariances {
+        bytes.extend(keyframe_id.to_le_bytes());
+        bytes.extend(upper_triangle().flat_map(|at| covariance[at].to_le_bytes()));
+    }
+    bytes
+}
+
+/// Parses [`covariance_bytes`] and checks every number.
+pub fn parse_covariances(mut bytes: &[u8]) -> Result<BTreeMap<u64, Matrix7>, LoopBytesError> {
+    let bytes = &mut bytes;
+    let mut covariances = BTreeMap::new();
+    for _ in 0..count(bytes, COVARIANCE_BYTES)? {
         let (keyframe_id, covariance) = (take(bytes)?, take_symmetric(bytes)?);
         if !is_covariance(&covariance) {
             return Err(LoopBytesError::Covariance(keyframe_id));
         }
-        loops.relative_covariances.insert(keyframe_id, covariance);
+        covariances.insert(keyframe_id, covariance);
     }
-    if bytes.is_empty() { Ok(loops) } else { Err(LoopBytesError::Length) }
+    if bytes.is_empty() { Ok(covariances) } else { Err(LoopBytesError::Length) }
+}
+
+/// Whether a symmetric matrix is finite and has no negative eigenvalue but by rounding.
+fn is_covariance(matrix: &Matrix7) -> bool {
+    if !matrix.iter().all(|x| x.is_finite()) {
+        return false;
+    }
+    let eigenvalues = matrix.symmetric_eigenvalues();
+    eigenvalues.min() >= -ROUNDING * eigenvalues.max()
 }
 
 /// Rows and columns of the upper triangle, row by row.
@@ -118,15 +140,6 @@ fn take_symmetric(bytes: &mut &[u8]) -> Result<Matrix7, LoopBytesError> {
         (matrix[(row, column)], matrix[(column, row)]) = (number, number);
     }
     Ok(matrix)
-}
-
-/// Whether a symmetric matrix is finite and has no negative eigenvalue but by rounding.
-fn is_covariance(matrix: &Matrix7) -> bool {
-    if !matrix.iter().all(|x| x.is_finite()) {
-        return false;
-    }
-    let eigenvalues = matrix.symmetric_eigenvalues();
-    eigenvalues.min() >= -ROUNDING * eigenvalues.max()
 }
 
 fn take<T: FromBytes>(bytes: &mut &[u8]) -> Result<T, LoopBytesError> {
@@ -163,7 +176,9 @@ pub(super) mod tests {
     #[test]
     fn loops_survive_their_bytes() {
         for loops in [loops(), LoopRecord::default()] {
-            assert_eq!(parse_loops(&loop_bytes(&loops)), Ok(loops));
+            let parsed = parse_loops(&loop_bytes(&loops)).unwrap();
+            let relative_covariances = parse_covariances(&covariance_bytes(&loops)).unwrap();
+            assert_eq!(LoopRecord { relative_covariances, ..parsed }, loops);
         }
     }
 
@@ -179,32 +194,37 @@ pub(super) mod tests {
             bytes[at..at + 8].copy_from_slice(&value.to_le_bytes());
             parse_loops(&bytes)
         };
-        let held_at = 8 + 8 + 2 * LINK_BYTES;
-        for (at, value) in [(8, u64::MAX), (8, 4), (held_at, u64::MAX), (held_at + 16, u64::MAX)] {
+        let held_at = 8 + 2 * LINK_BYTES;
+        for (at, value) in [(0, u64::MAX), (0, 3), (held_at, u64::MAX), (held_at + 16, u64::MAX)] {
             assert_eq!(with(at, value), Err(LoopBytesError::Length), "at {at}");
         }
         let nan = f64::NAN.to_bits();
-        let variance_at = 8 + 8 + 8 * (2 + 8);
+        let variance_at = 8 + 8 * (2 + 8);
         for (at, value) in
-            [(16, 3), (32, nan), (variance_at, nan), (variance_at, (-1.0f64).to_bits())]
+            [(8, 3), (24, nan), (variance_at, nan), (variance_at, (-1.0f64).to_bits())]
         {
             assert_eq!(with(at, value), Err(LoopBytesError::Link(0)), "at {at}");
         }
-        let last_triangle = whole.len() - 8 * 28;
-        for value in [nan, (-1.0f64).to_bits()] {
-            assert_eq!(with(last_triangle, value), Err(LoopBytesError::Covariance(9)));
-        }
-        assert_eq!(with(last_triangle - 8 * 31, 3), Err(LoopBytesError::Length));
     }
 
     #[test]
-    fn loops_of_the_first_version_have_no_covariances() {
-        let first = LoopRecord { relative_covariances: [].into(), ..loops() };
-        let bytes = loop_bytes(&first);
-        let of_first = &bytes[VERSION_2.len()..bytes.len() - 8];
-        assert_eq!(parse_loops(of_first), Ok(first));
-        for length in 0..of_first.len() {
-            assert!(parse_loops(&of_first[..length]).is_err(), "{length}");
+    fn every_cut_and_invalid_numbers_of_covariances_are_refused() {
+        let whole = covariance_bytes(&loops());
+        for length in 0..whole.len() {
+            assert!(parse_covariances(&whole[..length]).is_err(), "{length}");
+        }
+        assert!(parse_covariances(&[&whole[..], &[0]].concat()).is_err());
+        let with = |at: usize, value: u64| {
+            let mut bytes = whole.clone();
+            bytes[at..at + 8].copy_from_slice(&value.to_le_bytes());
+            parse_covariances(&bytes)
+        };
+        for number in [3, u64::MAX] {
+            assert_eq!(with(0, number), Err(LoopBytesError::Length));
+        }
+        let second = 8 + COVARIANCE_BYTES;
+        for value in [f64::NAN, f64::INFINITY, -1.0] {
+            assert_eq!(with(second + 8, value.to_bits()), Err(LoopBytesError::Covariance(9)));
         }
     }
 }

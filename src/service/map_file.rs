@@ -8,7 +8,8 @@
 //! u16, 3 × f32), number of image bytes (u64, 0 without an image), image bytes. Then the number of realigned frames
 //! (u64), each: sequence, keyframe (u64), pose relative to that (7 × f64); the number of points of the joint estimation
 //! (u64), each: keyframe (u64), u, v (u16), confirmations (u32), inverse depth, brightness (f32); bytes of the loops
-//! (u64), and these (`loop_bytes`).
+//! (u64), and these; bytes of their covariances (u64), and these (`loop_bytes`). Layout 9 ended before the
+//! covariances.
 
 use std::io::{self, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
@@ -18,10 +19,11 @@ use zerocopy::{FromBytes, IntoBytes};
 
 use crate::capture::input_file;
 use crate::service::atomic_file::write_atomically;
-use crate::service::loop_bytes::{LoopBytesError, MAX_LOOP_BYTES, loop_bytes, parse_loops};
+use crate::service::loop_bytes::{
+    LoopBytesError, MAX_LOOP_BYTES, covariance_bytes, loop_bytes, parse_covariances, parse_loops,
+};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, MAX_KEYFRAME_POINTS};
-use crate::slam::loops::record::LoopRecord;
 use crate::slam::map::{ConfirmedPoint, FramePose, Map};
 use crate::slam::pose::NO_KEYFRAME;
 use crate::wire::conversion::{
@@ -31,7 +33,9 @@ use crate::wire::conversion::{
 };
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense map 9\n";
+const MAGIC: [u8; 16] = *b"semidense map10\n";
+/// Those of the layout before it, which is read too.
+const MAGIC_9: [u8; 16] = *b"semidense map 9\n";
 /// Largest id or revision: later ones must not overflow.
 const MAX_NUMBER: u64 = u64::MAX / 2;
 /// Largest epoch, for the same reason.
@@ -148,9 +152,10 @@ fn write_rest(file: &mut impl Write, map: &Map) -> io::Result<()> {
         file.write_all(point.confirmations.as_bytes())?;
         file.write_all([point.inverse_depth, point.intensity].as_bytes())
     })?;
-    let loops = loop_bytes(&map.loops);
-    file.write_all((loops.len() as u64).as_bytes())?;
-    file.write_all(&loops)
+    [loop_bytes(&map.loops), covariance_bytes(&map.loops)].iter().try_for_each(|bytes| {
+        file.write_all((bytes.len() as u64).as_bytes())?;
+        file.write_all(bytes)
+    })
 }
 
 /// Reads the map that [`write_map`] wrote.
@@ -163,7 +168,8 @@ pub fn read_map(path: &Path) -> Result<Map, MapFileError> {
 /// Reads the map from the bytes of a file.
 pub fn parse_map(bytes: impl Read) -> Result<Map, MapFault> {
     let mut reader = Reader(bytes);
-    if reader.take::<[u8; 16]>()? != MAGIC {
+    let magic = reader.take::<[u8; 16]>()?;
+    if ![MAGIC, MAGIC_9].contains(&magic) {
         return Err(MapFault::Magic);
     }
     let free_epoch = reader.epoch()?;
@@ -184,7 +190,12 @@ pub fn parse_map(bytes: impl Read) -> Result<Map, MapFault> {
         // A point without its keyframe cannot be placed.
         map.confirmed.extend(Some(point).filter(|point| is_placed(&map, point)));
     }
-    map.loops = Arc::new(reader.loops()?);
+    let mut loops = parse_loops(&reader.loop_bytes()?)?;
+    match magic == MAGIC {
+        true => loops.relative_covariances = parse_covariances(&reader.loop_bytes()?)?,
+        false => loops.take_places_as_relative(map.keyframes.iter()),
+    }
+    map.loops = Arc::new(loops);
     match reader.0.read(&mut [0]) {
         Ok(0) => Ok(map),
         _ => Err(MapFault::Trailing),
@@ -309,12 +320,12 @@ impl<R: Read> Reader<R> {
         })
     }
 
-    fn loops(&mut self) -> Result<LoopRecord, MapFault> {
+    fn loop_bytes(&mut self) -> Result<Vec<u8>, MapFault> {
         let count = self.count("loop bytes", MAX_LOOP_BYTES)?;
         let mut bytes = Vec::new();
         // An invalid number reads no more than there is; the parser notices what is missing.
         self.0.by_ref().take(count).read_to_end(&mut bytes)?;
-        Ok(parse_loops(&bytes)?)
+        Ok(bytes)
     }
 }
 

@@ -239,10 +239,6 @@ impl Loops {
     pub fn resume_from(&mut self, known: Arc<LoopRecord>, keyframes: &[Keyframe]) {
         self.partners = known.partners();
         self.record = known;
-        if self.record.relative_covariances.is_empty() && !self.record.held_by.is_empty() {
-            let covariances = self.recorded_before(keyframes);
-            Arc::make_mut(&mut self.record).relative_covariances = covariances;
-        }
         let last = self.record.last_searched(keyframes);
         if self.record.searched_to != last {
             Arc::make_mut(&mut self.record).searched_to = last;

@@ -63,6 +63,24 @@ fn a_map_survives_the_file_bit_for_bit() {
 }
 
 #[test]
+fn in_the_layout_before_covariances_were_stored_places_were_relative() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("map.bin");
+    write_map(&path, &map(), &mut || ()).unwrap();
+    let mut bytes = std::fs::read(&path).unwrap();
+    bytes[..16].copy_from_slice(&MAGIC_9);
+    assert!(matches!(parse_map(&bytes[..]), Err(MapFault::Trailing)));
+    bytes.truncate(bytes.len() - 8 - covariance_bytes(&map().loops).len());
+    let read = parse_map(&bytes[..]).unwrap();
+    assert_eq!(read.keyframes, map().keyframes);
+    let covariances = &read.loops.relative_covariances;
+    assert!(covariances.keys().eq(&[7, 8]) && *covariances != map().loops.relative_covariances);
+    // Of the unit, which no adjoint changes.
+    assert!((covariances[&7][(6, 6)] - 0.01).abs() < 1e-12, "{covariances:?}");
+    assert!(parse_map(&bytes[..bytes.len() - 1]).is_err());
+}
+
+#[test]
 fn points_of_the_joint_estimation_lie_in_their_keyframes() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("map.bin");

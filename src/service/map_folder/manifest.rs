@@ -7,6 +7,8 @@
 //! * `CAMR`: width, height (u32), fx, fy, cx, cy (f64).
 //! * `STAT`: detail (u32), first free epoch (u32), revision of the map, number of saves, seconds since 1970 (u64).
 //! * `loop`: loops, as in `loop_bytes`; absent where there are none.
+//! * `cova`: covariances of keyframes relative to those that they were estimated against, as there; absent without
+//!   loops, and in maps of versions that did not store them.
 //! * `KEYF`: number of keyframes (u64), each: byte count (u32) of the keyframe without image and points as in
 //!   [`map_file`](crate::service::map_file), these bytes; then, 0 where it has no file, revision in the file's name,
 //!   bytes (u64), checksum, number of points (u32) of its file.
@@ -17,7 +19,9 @@ use std::sync::Arc;
 use zerocopy::{FromBytes, Immutable, IntoBytes};
 
 use crate::service::bytes;
-use crate::service::loop_bytes::{loop_bytes, parse_loops};
+use crate::service::loop_bytes::{
+    LoopBytesError, covariance_bytes, loop_bytes, parse_covariances, parse_loops,
+};
 use crate::service::map_file::{keyframe_bytes, parse_keyframe};
 use crate::service::map_folder::depth_file::{MapDetail, max_file_bytes};
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -32,6 +36,7 @@ const CAMERA: [u8; 4] = *b"CAMR";
 const STATE: [u8; 4] = *b"STAT";
 const KEYFRAMES: [u8; 4] = *b"KEYF";
 const LOOPS: [u8; 4] = *b"loop";
+const COVARIANCES: [u8; 4] = *b"cova";
 /// More keyframes than an hour at one each 30 ms: an invalid number, not a map.
 const MAX_KEYFRAMES: usize = 120_000;
 /// Largest epoch and largest revision: later ones must not overflow.
@@ -148,6 +153,7 @@ impl Manifest {
         push_section(&mut bytes, KEYFRAMES, &keyframes);
         if !self.loops.is_empty() {
             push_section(&mut bytes, LOOPS, &loop_bytes(&self.loops));
+            push_section(&mut bytes, COVARIANCES, &covariance_bytes(&self.loops));
         }
         bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
         bytes
@@ -175,7 +181,7 @@ impl Manifest {
             let length = usize::try_from(take::<u64>(&mut rest)?).ok();
             let payload = length.and_then(|length| rest.split_off(..length));
             let payload = payload.ok_or_else(|| damaged("a section is truncated"))?;
-            let is_known = [CAMERA, STATE, KEYFRAMES, LOOPS].contains(&tag);
+            let is_known = [CAMERA, STATE, KEYFRAMES, LOOPS, COVARIANCES].contains(&tag);
             if !is_known && !tag[0].is_ascii_lowercase() {
                 return Err(ManifestError::Section(tag.escape_ascii().to_string()));
             }
@@ -188,7 +194,17 @@ impl Manifest {
         manifest.read_state(part(STATE)?)?;
         manifest.read_keyframes(part(KEYFRAMES)?)?;
         if let Some(loops) = sections.get(&LOOPS) {
-            let parsed = parse_loops(loops).map_err(|error| damaged(&error.to_string()))?;
+            let refused = |error: LoopBytesError| damaged(&error.to_string());
+            let mut parsed = parse_loops(loops).map_err(refused)?;
+            match sections.get(&COVARIANCES) {
+                Some(bytes) => {
+                    parsed.relative_covariances = parse_covariances(bytes).map_err(refused)?;
+                }
+                None => {
+                    let keyframes = manifest.keyframes.iter().map(|listed| &listed.keyframe);
+                    parsed.take_places_as_relative(keyframes);
+                }
+            }
             manifest.loops = Arc::new(parsed);
         }
         Ok(manifest)
@@ -324,11 +340,27 @@ mod tests {
     fn loops_are_read_back_and_invalid_ones_are_refused() {
         let loops = Arc::new(crate::service::loop_bytes::tests::loops());
         let with = Manifest { loops, ..manifest() };
-        assert_eq!(Manifest::from_bytes(&with.to_bytes()), Ok(with));
-        let mut bytes = body();
-        push_section(&mut bytes, LOOPS, b"something");
-        let error = Manifest::from_bytes(&sealed(bytes)).unwrap_err().to_string();
+        assert_eq!(Manifest::from_bytes(&with.to_bytes()), Ok(with.clone()));
+        let refusal = |sections: &[([u8; 4], &[u8])]| {
+            let mut bytes = body();
+            sections.iter().for_each(|(tag, payload)| push_section(&mut bytes, *tag, payload));
+            Manifest::from_bytes(&sealed(bytes)).unwrap_err().to_string()
+        };
+        let error = refusal(&[(LOOPS, b"something")]);
         assert!(error.contains("loops"), "{error}");
+        let error = refusal(&[(LOOPS, &loop_bytes(&with.loops)), (COVARIANCES, b"something")]);
+        assert!(error.contains("loops"), "{error}");
+    }
+
+    #[test]
+    fn before_covariances_were_stored_places_were_relative() {
+        let loops = crate::service::loop_bytes::tests::loops();
+        let mut bytes = body();
+        push_section(&mut bytes, LOOPS, &loop_bytes(&loops));
+        let found = Manifest::from_bytes(&sealed(bytes)).unwrap().loops;
+        // Of 7, 8 and 9, which were held, the map has 9.
+        assert!(found.relative_covariances.keys().eq(&[9]), "{found:?}");
+        assert_eq!(found.held_by, loops.held_by);
     }
 
     #[test]

@@ -22,7 +22,7 @@ use crate::slam::loops::record::Link;
 /// estimate claims, and those without an estimate. The least are an eighth of a pixel at f = 250 and the uncertainty of
 /// a scale that a thousand points hold; the others those of a step to the next keyframe by the tracker alone.
 pub(super) const MIN_STD_DEVS: [f64; 3] = [0.0005, 0.0005, 0.001];
-const UNESTIMATED: [f64; 3] = [0.03, 0.02, 0.05];
+pub(super) const UNESTIMATED: [f64; 3] = [0.03, 0.02, 0.05];
 
 /// The pose graph of an epoch.
 pub(super) struct Chain {
@@ -136,20 +136,13 @@ impl Loops {
         let covariance = known * self.params.drift_inflation + of_deviations(MIN_STD_DEVS);
         covariance.cholesky().map(|_| covariance)
     }
-
-    /// Covariances in a map of a version that did not record them: there the place covariance is the relative one.
-    pub(super) fn recorded_before(&self, keyframes: &[Keyframe]) -> BTreeMap<u64, Matrix7> {
-        let estimated =
-            keyframes.iter().filter(|of| self.record.held_by.contains_key(&of.keyframe_id));
-        let relative = |of: &Keyframe| {
-            (of.keyframe_id, relative_covariance(&of.map_from_keyframe, &of.place_covariance))
-        };
-        estimated.map(relative).collect()
-    }
 }
 
 /// Covariance of the left increment of `newer_from_older` from that of the newer one's pose.
-fn relative_covariance(map_from_newer: &Sim3, place: &KeyframePoseCovariance) -> Matrix7 {
+pub(super) fn relative_covariance(
+    map_from_newer: &Sim3,
+    place: &KeyframePoseCovariance,
+) -> Matrix7 {
     let mut by_errors = map_from_newer.inverse().adjoint();
     by_errors.fixed_view_mut::<7, 1>(0, 6).fill(0.0);
     by_errors[(6, 6)] = 1.0;

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::slam::geometry::sim3::{Matrix7, Sim3};
 use crate::slam::graph::constraint::Measurement;
 use crate::slam::keyframe::Keyframe;
+use crate::slam::loops::chain::relative_covariance;
 
 /// A loop: a measurement between two keyframes, by their ids.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -50,6 +51,16 @@ impl LoopRecord {
     /// Keyframes at the ends of loops.
     pub fn keyframe_ids(&self) -> BTreeSet<u64> {
         self.links.iter().flat_map(|link| [link.i, link.j]).collect()
+    }
+
+    /// Takes the place covariances of keyframes that were estimated as those relative to others, which they were before
+    /// these were stored.
+    pub fn take_places_as_relative<'a>(&mut self, keyframes: impl Iterator<Item = &'a Keyframe>) {
+        let estimated = keyframes.filter(|of| self.held_by.contains_key(&of.keyframe_id));
+        let relative = |of: &Keyframe| {
+            (of.keyframe_id, relative_covariance(&of.map_from_keyframe, &of.place_covariance))
+        };
+        self.relative_covariances = estimated.map(relative).collect();
     }
 
     /// Merges the loops of two maps, with `ids` added to the ids of the second.

@@ -3,7 +3,7 @@
 
 use crate::slam::geometry::sim3::{Matrix7, Sim3, Twist7};
 use crate::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Refusal, Start};
-use crate::slam::loops::chain::{Chain, MIN_STD_DEVS, of_deviations};
+use crate::slam::loops::chain::{Chain, MIN_STD_DEVS, UNESTIMATED, of_deviations};
 use crate::slam::loops::record::Link;
 use crate::slam::loops::{Job, Loops, Pair, Plan, SearchOutcome, Stage, confirmations};
 
@@ -109,8 +109,16 @@ impl Loops {
             let adjoint = by.adjoint();
             adjoint * covariance * adjoint.transpose()
         };
-        // The first one of an epoch has no error.
-        let of_link = |id| self.link_covariance(id).unwrap_or_else(|| of_deviations(MIN_STD_DEVS));
+        // The first keyframe of an epoch has no error.
+        let is_first = |id: u64| {
+            let first = job.nodes.first().map(|node| node.keyframe_id);
+            self.epoch_starts.contains(&id) || first == Some(id)
+        };
+        let of_link = |id| match self.link_covariance(id) {
+            Some(covariance) => covariance,
+            None if is_first(id) => of_deviations(MIN_STD_DEVS),
+            None => of_deviations(UNESTIMATED),
+        };
         let (of_near_i, of_near_j) = (of_link(confirmation.i), of_link(confirmation.j));
         let covariance = confirmation.covariance
             + along(&near_j_from_j, &link.covariance)

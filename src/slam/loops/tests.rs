@@ -68,7 +68,7 @@ impl Course {
                 let relative = KeyframePoseCovariance::bounded(&covariance);
                 loops.note_covariance(id, &map_from_keyframe, &relative);
             }
-            // Of no account for links: these have covariances of their own.
+            // Not used for links, which have covariances of their own.
             let in_map = KeyframePoseMatrix::identity() * if id == 0 { 0.0 } else { IN_MAP };
             let place_covariance = KeyframePoseCovariance::bounded(&in_map);
             let keyframe =
@@ -247,9 +247,12 @@ fn two_epochs_that_see_the_same_become_one() {
     let truth = places[4];
     assert!((last.rigid.translation - truth.translation).norm() < 0.03, "{last:?} {into_epoch:?}");
     assert!((last.scale / UNIT).ln().abs() < 0.02, "{last:?}");
-    // Its own, those of both keyframes that the epochs are joined by, of which the older may be exact, and the link's.
+    // Its own, those of both keyframes that the epochs are joined by, of which the first is exact, and the link's.
     let of_unit = course.map.keyframes.last().unwrap().place_covariance.matrix()[(6, 6)];
-    assert!((2.0 * IN_MAP..3.1 * IN_MAP).contains(&of_unit), "{of_unit}");
+    let link = &course.loops.record().links[0];
+    let terms = if link.i.min(link.j) == 0 { 2.0 } else { 3.0 };
+    let expected = terms * IN_MAP + link.covariance[(6, 6)];
+    assert!((of_unit - expected).abs() < 1e-9, "{of_unit} {expected}");
 }
 
 #[test]

@@ -159,7 +159,7 @@ impl Mapper {
             return false;
         }
         let found = known.map_from_keyframe.transform_pose(at).rotation;
-        // Without the drift of the map, which the limit contains.
+        // Without the drift of the map, which the limit allows for.
         let uncertain = rotation_std_dev(&full_covariance(&pose.covariance));
         found.angle_to(&pose.map_from_camera.rotation)
             > MAX_DRIFT_RAD + MAX_POSE_DEVIATIONS * uncertain

@@ -4,6 +4,8 @@
 //! against newer ones too, which were themselves estimated against it, and the same errors would be counted again with
 //! every pass.
 
+use crate::slam::window::members::MIN_COMMON;
+
 /// A keyframe that held another in place.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Holder {
@@ -20,16 +22,17 @@ pub(super) struct Comparisons {
     pub inliers: usize,
 }
 
-/// For each member, by id, the older fixed ones that hold it: those compared with the free ones that it is connected
+/// For each member, the fixed ones with smaller ids that hold it: those compared with the free ones that it is connected
 /// to. Empty for fixed members, and where there are none.
 pub(super) fn holders(
     ids: &[u64],
     is_free: &[bool],
     comparisons: &[Comparisons],
 ) -> Vec<Vec<Holder>> {
-    let group = groups(is_free, comparisons);
+    let connections = connections(ids.len(), comparisons);
+    let group = groups(is_free, &connections);
     let mut counts = vec![vec![0; ids.len()]; ids.len()];
-    for &Comparisons { members: [one, other], inliers } in comparisons {
+    for &Comparisons { members: [one, other], inliers } in &connections {
         match (is_free[one], is_free[other]) {
             (true, false) => counts[group[one]][other] += inliers,
             (false, true) => counts[group[other]][one] += inliers,
@@ -46,13 +49,27 @@ pub(super) fn holders(
     (0..ids.len()).map(of_member).collect()
 }
 
-/// For each member, the first of the free ones that comparisons connect it to.
-fn groups(is_free: &[bool], comparisons: &[Comparisons]) -> Vec<usize> {
+/// Those of two members in both directions together, where they are enough for one to hold the other.
+fn connections(num_members: usize, comparisons: &[Comparisons]) -> Vec<Comparisons> {
+    let mut inliers = vec![vec![0; num_members]; num_members];
+    for of in comparisons {
+        let [one, other] = of.members;
+        inliers[one.min(other)][one.max(other)] += of.inliers;
+    }
+    let pairs =
+        (0..num_members).flat_map(|one| (one + 1..num_members).map(move |other| [one, other]));
+    let of_pair =
+        |members: [usize; 2]| Comparisons { members, inliers: inliers[members[0]][members[1]] };
+    pairs.map(of_pair).filter(|of| of.inliers >= MIN_COMMON).collect()
+}
+
+/// For each member, the first of the free ones that it is connected to.
+fn groups(is_free: &[bool], connections: &[Comparisons]) -> Vec<usize> {
     let mut group: Vec<usize> = (0..is_free.len()).collect();
-    let connecting = |of: &&Comparisons| of.inliers > 0 && of.members.iter().all(|&of| is_free[of]);
+    let is_free = |of: &&Comparisons| of.members.iter().all(|&of| is_free[of]);
     loop {
         let mut is_settled = true;
-        for &Comparisons { members: [one, other], .. } in comparisons.iter().filter(connecting) {
+        for &Comparisons { members: [one, other], .. } in connections.iter().filter(is_free) {
             let first = group[one].min(group[other]);
             is_settled &= group[one] == first && group[other] == first;
             (group[one], group[other]) = (first, first);
@@ -85,7 +102,7 @@ mod tests {
     #[test]
     fn shares_are_those_of_the_comparisons_with_all_that_is_connected() {
         // 3 is compared with 2 alone, in both directions; 1 sees nothing of the free ones.
-        let compared = [(0, 2, 20), (2, 0, 10), (1, 3, 0), (2, 3, 5), (3, 2, 5), (1, 2, 10)];
+        let compared = [(0, 2, 50), (2, 0, 10), (1, 3, 19), (2, 3, 10), (3, 2, 10), (1, 2, 20)];
         let found = held(&[10, 11, 12, 13], &[0, 1], &compared);
         let expected = vec![(10, 0.75), (11, 0.25)];
         assert_eq!(found, [vec![], vec![], expected.clone(), expected]);
@@ -93,7 +110,7 @@ mod tests {
 
     #[test]
     fn what_is_not_connected_has_separate_holders() {
-        let compared = [(0, 2, 20), (1, 3, 10), (3, 4, 1), (2, 3, 0)];
+        let compared = [(0, 2, 20), (1, 3, 30), (3, 4, 20), (2, 3, 19)];
         let found = held(&[10, 11, 12, 13, 14], &[0, 1], &compared);
         let by = |id: u64| vec![(id, 1.0)];
         assert_eq!(found, [vec![], vec![], by(10), by(11), by(11)]);

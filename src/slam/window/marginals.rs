@@ -112,7 +112,7 @@ pub(super) fn marginals(
     marginals.filter(is_finite).collect()
 }
 
-/// For each member, the keyframes that hold it.
+/// For each member, the older fixed keyframes that hold it.
 fn holders_of(
     keyframes: &[WindowKeyframe],
     members: &Members<'_>,
