@@ -325,3 +325,24 @@ fn a_loop_is_confirmed_where_the_keyframes_next_to_it_lost_their_depth() {
         assert!(after < 0.5 * before, "{seed}: {before} {after} {reports:?}");
     }
 }
+
+#[test]
+fn links_are_as_uncertain_as_their_estimates() {
+    const CLAIMED: f64 = 0.02;
+    let mut course = Course::of(&Scene::new(0), &round()[..3], CLAIMED, 0.0, 0);
+    let nodes: Vec<Keyframe> = course.map.keyframes.iter().map(Keyframe::without_depth).collect();
+    let of_unit = |loops: &Loops| {
+        let mut predictions = Chain::new(loops, &nodes, 0).unwrap().into_predictions().unwrap();
+        [1, 2].map(|to| predictions.of(0, to).unwrap().1[(6, 6)].sqrt())
+    };
+    let near = |found: [f64; 2], one: f64| {
+        let expected = [one, one * 2.0_f64.sqrt()];
+        found.iter().zip(expected).all(|(found, expected)| (found / expected - 1.0).abs() < 0.01)
+    };
+    let found = of_unit(&course.loops);
+    assert!(near(found, CLAIMED), "{found:?}");
+    // Where the estimate gave no covariance, as those of the tracker alone.
+    Arc::make_mut(&mut course.loops.record).relative_covariances.clear();
+    let found = of_unit(&course.loops);
+    assert!(near(found, 0.05), "{found:?}");
+}
