@@ -120,6 +120,15 @@ impl KeyframePoseCovariance {
         self.matrix().diagonal().iter().zip(IGNORANCE).any(|(&variance, bound)| variance >= bound)
     }
 
+    /// Covariance of the left increment (translation, rotation, log scale) of `keyframe_from_map`, in the keyframe's
+    /// unit, where this is that of its pose: of `keyframe_from_other` if it is relative to another.
+    pub fn of_left_increment(&self, map_from_keyframe: &Sim3) -> KeyframePoseMatrix {
+        let mut by_errors = map_from_keyframe.inverse().adjoint();
+        by_errors.fixed_view_mut::<7, 1>(0, 6).fill(0.0);
+        by_errors[(6, 6)] = 1.0;
+        by_errors * self.matrix() * by_errors.transpose()
+    }
+
     /// With that of an independent error added.
     pub fn plus(&self, other: &KeyframePoseMatrix) -> Self {
         Self::bounded(&(self.matrix() + other))

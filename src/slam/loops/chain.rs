@@ -124,7 +124,7 @@ impl Loops {
         relative_place: &KeyframePoseCovariance,
     ) {
         if self.is_on() {
-            let covariance = relative_covariance(map_from_keyframe, relative_place);
+            let covariance = relative_place.of_left_increment(map_from_keyframe);
             Arc::make_mut(&mut self.record).relative_covariances.insert(keyframe_id, covariance);
         }
     }
@@ -136,17 +136,6 @@ impl Loops {
         let covariance = known * self.params.drift_inflation + of_deviations(MIN_STD_DEVS);
         covariance.cholesky().map(|_| covariance)
     }
-}
-
-/// Covariance of the left increment of `newer_from_older` from that of the newer one's pose.
-pub(super) fn relative_covariance(
-    map_from_newer: &Sim3,
-    place: &KeyframePoseCovariance,
-) -> Matrix7 {
-    let mut by_errors = map_from_newer.inverse().adjoint();
-    by_errors.fixed_view_mut::<7, 1>(0, 6).fill(0.0);
-    by_errors[(6, 6)] = 1.0;
-    by_errors * place.matrix() * by_errors.transpose()
 }
 
 pub(super) fn of_deviations([translation, rotation, scale]: [f64; 3]) -> Matrix7 {

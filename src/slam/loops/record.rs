@@ -5,7 +5,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::slam::geometry::sim3::{Matrix7, Sim3};
 use crate::slam::graph::constraint::Measurement;
 use crate::slam::keyframe::Keyframe;
-use crate::slam::loops::chain::relative_covariance;
 
 /// A loop: a measurement between two keyframes, by their ids.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -58,7 +57,7 @@ impl LoopRecord {
     pub fn take_places_as_relative<'a>(&mut self, keyframes: impl Iterator<Item = &'a Keyframe>) {
         let estimated = keyframes.filter(|of| self.held_by.contains_key(&of.keyframe_id));
         let relative = |of: &Keyframe| {
-            (of.keyframe_id, relative_covariance(&of.map_from_keyframe, &of.place_covariance))
+            (of.keyframe_id, of.place_covariance.of_left_increment(&of.map_from_keyframe))
         };
         self.relative_covariances = estimated.map(relative).collect();
     }
