@@ -138,6 +138,13 @@ impl Loops {
     }
 }
 
+/// Covariance of a left increment that is carried along by a similarity to its left.
+pub(super) fn along(by: &Sim3, covariance: &Matrix7) -> Matrix7 {
+    let adjoint = by.adjoint();
+    adjoint * covariance * adjoint.transpose()
+}
+
+/// Covariance of independent errors with these standard deviations (translation, rotation, ln s).
 pub(super) fn of_deviations([translation, rotation, scale]: [f64; 3]) -> Matrix7 {
     let (t, r) = (translation * translation, rotation * rotation);
     Matrix7::from_diagonal(&[t, t, t, r, r, r, scale * scale].into())

@@ -4,11 +4,11 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 
-use crate::slam::geometry::sim3::{Matrix7, Sim3};
+use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::{GraphParams, optimise};
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::keyframe_pose_covariance::KeyframePoseCovariance;
-use crate::slam::loops::chain::Chain;
+use crate::slam::loops::chain::{Chain, along};
 use crate::slam::loops::record::Link;
 use crate::slam::loops::search::LARGEST_CHI2;
 use crate::slam::loops::{Job, Loops, SearchOutcome};
@@ -120,10 +120,6 @@ fn join_covariance(
     newer: &Keyframe,
     into_from_epoch: &Sim3,
 ) -> KeyframePoseCovariance {
-    let along = |by: &Sim3, covariance: &Matrix7| {
-        let adjoint = by.adjoint();
-        adjoint * covariance * adjoint.transpose()
-    };
     // Of the left increment of a keyframe's similarity: its errors at the origin.
     let of_keyframe = |of: &Keyframe| of.uncertain_pose().covariance_at(&Vector3::zeros());
     let older_from_j = match link.j == older.keyframe_id {

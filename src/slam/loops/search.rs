@@ -3,7 +3,7 @@
 
 use crate::slam::geometry::sim3::{Matrix7, Sim3, Twist7};
 use crate::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Refusal, Start};
-use crate::slam::loops::chain::{Chain, MIN_STD_DEVS, UNESTIMATED, of_deviations};
+use crate::slam::loops::chain::{Chain, MIN_STD_DEVS, UNESTIMATED, along, of_deviations};
 use crate::slam::loops::record::Link;
 use crate::slam::loops::{Job, Loops, Pair, Plan, SearchOutcome, Stage, confirmations};
 
@@ -105,10 +105,6 @@ impl Loops {
         // near_j_from_near_i through the loop and the links next to it.
         let (near_j_from_j, i_from_near_i) = (near_j.inverse() * j, i.inverse() * near_i);
         let expected = near_j_from_j * link.j_from_i * i_from_near_i;
-        let along = |by: &Sim3, covariance: &Matrix7| {
-            let adjoint = by.adjoint();
-            adjoint * covariance * adjoint.transpose()
-        };
         // The first keyframe of an epoch has no error.
         let is_first = |id: u64| {
             let first = job.nodes.first().map(|node| node.keyframe_id);

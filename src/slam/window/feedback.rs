@@ -250,10 +250,15 @@ pub(super) mod tests {
         };
         map.keyframes[0].place_covariance = KeyframePoseCovariance::bounded(&of_unit(4e-4));
         map.keyframes[1].place_covariance = KeyframePoseCovariance::bounded(&of_unit(8e-4));
-        // 3 is held by 2, which the same estimates place relative to 0 and 1, one unit to the right of 1.
-        window.marginals.extend([marginal(2, &[(0, 0.25), (1, 0.75)]), marginal(3, &[(2, 1.0)])]);
+        // The window has moved what the map still has elsewhere.
+        map.keyframes.iter_mut().for_each(|of| of.map_from_keyframe.rigid.translation.x *= 3.0);
+        // 3 is held by 2, which the same estimates place relative to 0 and 1, one unit to the right of 1; nothing older
+        // holds 1.
+        let held_by: [&[(u64, f64)]; 3] = [&[], &[(0, 0.25), (1, 0.75)], &[(2, 1.0)]];
+        window.marginals.extend((1..).zip(held_by).map(|(id, by)| marginal(id, by)));
         let relative = KeyframePoseCovariance::bounded(&(KeyframePoseMatrix::identity() * 1e-4));
         let found = window.covariances(&map, |_| (ModeCovariance::ZERO, Some(relative)));
+        assert_eq!((found[&1].relative_place, found[&1].place), (Some(relative), None));
         let entries = |id: u64| {
             let found = &found[&id];
             assert_eq!(found.relative_place, Some(relative));
