@@ -15,6 +15,7 @@ use semidense::capture::opening::{SourceParams, open};
 use semidense::capture::source::FrameSource;
 use semidense::capture::source_name::SourceName;
 use semidense::service::config::Config;
+use semidense::service::corrected::Corrections;
 use semidense::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, replay};
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
@@ -77,7 +78,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
         initial_depth: DepthOrigin::Images,
         max_frames: arguments.frames,
         strict: true,
-        brighten: true,
+        corrections: Corrections::default(),
         mask: None,
     };
     let name = arguments.source.to_string();

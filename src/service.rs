@@ -3,7 +3,6 @@
 pub mod adjustments;
 pub mod alignment_stamps;
 pub mod atomic_file;
-pub(crate) mod brighten;
 pub(crate) mod budget;
 pub(crate) mod bytes;
 pub(crate) mod capture;
@@ -12,6 +11,7 @@ pub mod child;
 pub mod clock;
 pub mod config;
 pub mod config_error;
+pub mod corrected;
 pub(crate) mod doctor;
 pub(crate) mod early_wake;
 pub(crate) mod error_log;

@@ -23,6 +23,7 @@ pub mod odometry;
 pub mod parameter;
 pub mod places;
 pub mod pose;
+pub mod rolling_shutter;
 #[cfg(test)]
 pub mod test_scene;
 pub mod tracker;

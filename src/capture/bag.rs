@@ -28,6 +28,7 @@ use crate::capture::rig::Rig;
 use crate::capture::source::{FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
 use crate::capture::v4l::stamps::StampOrder;
+use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// A topic's images as a frame source.
@@ -169,6 +170,14 @@ impl Bag {
 impl FrameSource for Bag {
     fn intrinsics(&self) -> Intrinsics {
         self.rectifier.intrinsics()
+    }
+
+    fn camera(&self) -> CameraModel {
+        *self.rectifier.camera()
+    }
+
+    fn readout_s(&self) -> Option<f64> {
+        (!self.marks_hidden()).then(|| self.rectifier.readout_s())
     }
 
     fn rectified(&self, raw: &[u8]) -> Vec<u8> {

@@ -63,6 +63,11 @@ impl FrameSource for Looped {
         self.inner.rectified(raw)
     }
 
+    /// Frames that are played backwards or at another rate cannot be corrected.
+    fn readout_s(&self) -> Option<f64> {
+        None
+    }
+
     fn marks_hidden(&self) -> bool {
         self.inner.marks_hidden()
     }

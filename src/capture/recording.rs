@@ -11,6 +11,7 @@ use crate::capture::rectifier::Rectifier;
 use crate::capture::rig::Rig;
 use crate::capture::source::{FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
+use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
 use crate::slam::trajectory::StampedPose;
@@ -81,6 +82,14 @@ impl Recording {
 impl FrameSource for Recording {
     fn intrinsics(&self) -> Intrinsics {
         self.rectifier.intrinsics()
+    }
+
+    fn camera(&self) -> CameraModel {
+        *self.rectifier.camera()
+    }
+
+    fn readout_s(&self) -> Option<f64> {
+        Some(self.rectifier.readout_s())
     }
 
     fn rectified(&self, raw: &[u8]) -> Vec<u8> {

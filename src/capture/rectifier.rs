@@ -5,6 +5,7 @@ use std::path::Path;
 use crate::capture::rig::Rig;
 use crate::capture::source_error::SourceError;
 use crate::capture::v4l::pixel_format::{InvalidPicture, PixelFormat, unpack_gray};
+use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::Rectification;
 use crate::slam::image::buffer::Image;
@@ -12,6 +13,8 @@ use crate::slam::image::buffer::Image;
 /// Rectifies the images of a source's camera.
 #[derive(Debug)]
 pub struct Rectifier {
+    camera: CameraModel,
+    readout_s: f64,
     rectification: Rectification,
     /// The raw image; empty if it is the rectified one.
     raw: Vec<u8>,
@@ -26,7 +29,23 @@ impl Rectifier {
             .map_err(|source| SourceError::Rectification { path: rig_path.to_owned(), source })?;
         let Intrinsics { width, height, .. } = *rectification.intrinsics();
         let raw = if rectification.is_identity() { Vec::new() } else { vec![0; width * height] };
-        Ok(Self { rectification, raw, samples: Vec::new() })
+        Ok(Self {
+            camera: rig.camera,
+            readout_s: 1e-3 * rig.readout_ms,
+            rectification,
+            raw,
+            samples: Vec::new(),
+        })
+    }
+
+    /// The camera of the raw images.
+    pub fn camera(&self) -> &CameraModel {
+        &self.camera
+    }
+
+    /// Time in which all rows are read out, seconds.
+    pub fn readout_s(&self) -> f64 {
+        self.readout_s
     }
 
     /// Intrinsics of the rectified images; raw images have the same size.

@@ -34,14 +34,18 @@ const USUAL_DEG: std::ops::RangeInclusive<f64> = 10.0..=160.0;
 const USUAL_ASPECT: f64 = 1.5;
 /// Allowed frame rates, frames per second.
 const RATE_RANGE: std::ops::RangeInclusive<f64> = 0.1..=1000.0;
+/// Allowed read-out times of all rows, milliseconds; slow webcams need 60.
+const READOUT_RANGE: std::ops::RangeInclusive<f64> = 0.0..=200.0;
 
-/// One camera: lens, intrinsics of the raw image and, if known, its frame rate.
+/// One camera: lens, intrinsics of the raw image, how long it reads out rows and, if known, its frame rate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rig {
     /// The calibrated camera.
     pub camera: CameraModel,
     /// Frames per second, if the rig gives it.
     pub rate_hz: Option<f64>,
+    /// Time in which all rows are read out, milliseconds; 0 if they are exposed together.
+    pub readout_ms: f64,
 }
 
 /// The lens models of a rig file.
@@ -79,6 +83,9 @@ pub struct RigFile {
     pub coefficients: Vec<f64>,
     /// Frames per second.
     pub rate_hz: Option<f64>,
+    /// Time in which all rows are read out (rolling shutter), milliseconds; 0 if they are exposed together.
+    #[serde(default)]
+    pub readout_ms: f64,
 }
 
 impl Rig {
@@ -134,7 +141,18 @@ impl Rig {
         let model = if coefficients.is_empty() { LensModel::Pinhole } else { LensModel::Radtan };
         let (width, height) = (side(width), side(height));
         let coefficients = coefficients.to_vec();
-        let file = RigFile { model, width, height, fx, fy, cx, cy, coefficients, rate_hz: None };
+        let file = RigFile {
+            model,
+            width,
+            height,
+            fx,
+            fy,
+            cx,
+            cy,
+            coefficients,
+            rate_hz: None,
+            readout_ms: 0.0,
+        };
         Ok(file.rig_of(path)?)
     }
 
@@ -247,6 +265,7 @@ impl RigFile {
         if let Some(rate_hz) = self.rate_hz {
             check_range("rate_hz", rate_hz, RATE_RANGE)?;
         }
+        check_range("readout_ms", self.readout_ms, READOUT_RANGE)?;
         let Self { width, height, fx, fy, cx, cy, .. } = *self;
         let count_error = |allowed: &str| ParameterError {
             key: "coefficients".to_owned(),
@@ -265,7 +284,7 @@ impl RigFile {
         let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
         let camera = CameraModel::new(intrinsics, lens)
             .ok_or_else(|| count_error("finite numbers that belong to a camera"))?;
-        Ok(Rig { camera, rate_hz: self.rate_hz })
+        Ok(Rig { camera, rate_hz: self.rate_hz, readout_ms: self.readout_ms })
     }
 }
 

@@ -268,6 +268,14 @@ impl FrameSource for Simulator {
         *self.rectification.intrinsics()
     }
 
+    fn camera(&self) -> CameraModel {
+        self.camera
+    }
+
+    fn readout_s(&self) -> Option<f64> {
+        Some(1e-6 * self.params.sensor.row_time_us * self.params.height as f64)
+    }
+
     fn num_frames(&self) -> Option<usize> {
         Some(self.params.frames)
     }

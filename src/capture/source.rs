@@ -4,6 +4,7 @@ use std::fs::File;
 use std::os::fd::BorrowedFd;
 
 use crate::capture::source_error::SourceError;
+use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
 use crate::slam::trajectory::StampedPose;
@@ -84,6 +85,17 @@ pub struct Notice {
 pub trait FrameSource: Send {
     /// Intrinsics of the rectified frames.
     fn intrinsics(&self) -> Intrinsics;
+
+    /// The camera of the images before they are rectified.
+    fn camera(&self) -> CameraModel {
+        CameraModel::undistorted(self.intrinsics())
+    }
+
+    /// Time in which the camera reads out all rows, seconds; 0 if they are exposed together, `None` if its frames have
+    /// been corrected already or cannot be.
+    fn readout_s(&self) -> Option<f64> {
+        Some(0.0)
+    }
 
     /// An image of this source's camera, `width * height` pixels, rectified like the frames.
     fn rectified(&self, raw: &[u8]) -> Vec<u8> {

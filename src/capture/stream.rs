@@ -23,6 +23,7 @@ use crate::capture::source::{Arrival, FrameClocks, FrameLosses, FrameSource, Fra
 use crate::capture::source_error::SourceError;
 use crate::capture::v4l::READ_MILLIS;
 use crate::capture::v4l::stamps::{FrameNumbers, StampOrder};
+use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// The program that reads ROS 2 topics.
@@ -259,6 +260,14 @@ fn stamp_of(header: &StreamHeader, arrival_nanos: i64, realtime_nanos: i64) -> (
 impl FrameSource for StreamSource {
     fn intrinsics(&self) -> Intrinsics {
         self.rectifier.intrinsics()
+    }
+
+    fn camera(&self) -> CameraModel {
+        *self.rectifier.camera()
+    }
+
+    fn readout_s(&self) -> Option<f64> {
+        Some(self.rectifier.readout_s())
     }
 
     fn rectified(&self, raw: &[u8]) -> Vec<u8> {

@@ -34,6 +34,7 @@ use crate::capture::rectifier::Rectifier;
 use crate::capture::rig::Rig;
 use crate::capture::source::{Arrival, FrameLosses, FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
+use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 pub use self::pixel_format::{InvalidPicture, PixelFormat};
@@ -100,6 +101,14 @@ impl<S: VideoSystem> CameraSource<S> {
 impl<S: VideoSystem> FrameSource for CameraSource<S> {
     fn intrinsics(&self) -> Intrinsics {
         self.rectifier.intrinsics()
+    }
+
+    fn camera(&self) -> CameraModel {
+        *self.rectifier.camera()
+    }
+
+    fn readout_s(&self) -> Option<f64> {
+        Some(self.rectifier.readout_s())
     }
 
     fn rectified(&self, raw: &[u8]) -> Vec<u8> {

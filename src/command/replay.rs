@@ -227,7 +227,7 @@ fn replay_config(config: &Config, args: &ReplayArgs) -> ReplayConfig {
         initial_depth: args.initial_depth,
         max_frames: args.frames.map(|frames| frames as usize),
         strict: config.capture.strict,
-        brighten: config.capture.brighten,
+        corrections: config.capture.corrections(),
         mask: None,
     }
 }

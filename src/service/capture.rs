@@ -8,10 +8,10 @@ use crate::capture::opening::{check_size, open, rig_remarks};
 use crate::capture::source::{Arrival, FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
 use crate::capture::source_name::SourceName;
-use crate::service::brighten::Brightened;
 use crate::service::child::{is_supervised, prepared_frames};
 use crate::service::clock::{Pace, duration_from_nanos, now_nanos, realtime_of};
 use crate::service::config::Config;
+use crate::service::corrected::Corrected;
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
@@ -85,7 +85,7 @@ struct Shell<'a> {
     config: &'a Config,
     mode: Mode,
     shutdown: &'a Shutdown,
-    source: Brightened<Box<dyn FrameSource>>,
+    source: Corrected<Box<dyn FrameSource>>,
     intrinsics: Intrinsics,
     frames: Publisher<u8, FrameHeader>,
     steps: Subscriber<StepMessage, ()>,
@@ -128,7 +128,7 @@ impl<'a> Shell<'a> {
         let source = open(&options.source, rig, &config.source_params())?;
         let read_mask = |path: &PathBuf| Mask::read(path, source.as_ref());
         let mask = options.mask.as_ref().map(read_mask).transpose()?;
-        let source = Brightened::new(source, config.capture.brighten, mask);
+        let source = Corrected::new(source, &config.capture.corrections(), mask);
         for remark in rig_remarks(&options.source, rig) {
             tracing::warn!("{remark}");
         }

@@ -20,6 +20,7 @@ use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::v4l::params::CameraParams;
 pub use crate::service::config::origins::{EffectiveKey, Origin};
 pub use crate::service::config_error::ConfigError;
+use crate::service::corrected::Corrections;
 use crate::service::map_folder::depth_file::MapDetail;
 use crate::service::results::ResultsParams;
 use crate::service::schedule::{Background, SchedulingParams};
@@ -87,6 +88,10 @@ pub struct CaptureConfig {
     pub strict: bool,
     /// Whether the grey levels of dim images are doubled up to three times before anything is estimated from them.
     pub brighten: bool,
+    /// Whether the rolling shutter is undone: images are resampled as if all rows had been exposed together.
+    pub undo_rolling_shutter: bool,
+    /// Time in which the camera reads out all rows, milliseconds; 0 is what the rig says.
+    pub readout_ms: f64,
     /// Longest wait for tracker and mapper to get ready before a recording starts, seconds.
     pub connect_timeout_s: f64,
     /// Lockstep: longest wait for a frame to enter the map, seconds.
@@ -105,11 +110,22 @@ impl Default for CaptureConfig {
             mask: String::new(),
             strict: false,
             brighten: true,
+            undo_rolling_shutter: true,
+            readout_ms: 0.0,
             connect_timeout_s: 30.0,
             step_timeout_s: 60.0,
             scheduling: SchedulingParams { priority: 80, ..SchedulingParams::default() },
             camera: CameraParams::default(),
         }
+    }
+}
+
+impl CaptureConfig {
+    /// What is corrected in the images.
+    pub fn corrections(&self) -> Corrections {
+        let configured_s = (self.readout_ms > 0.0).then_some(1e-3 * self.readout_ms);
+        let readout_s = if self.undo_rolling_shutter { configured_s } else { Some(0.0) };
+        Corrections { brighten: self.brighten, readout_s }
     }
 }
 
@@ -310,6 +326,7 @@ impl Config {
         // More than an hour is a mistaken unit.
         let seconds = 0.1..=3600.0;
         let capture = &self.capture;
+        check_range("capture.readout_ms", capture.readout_ms, 0.0..=200.0)?;
         check_range("capture.connect_timeout_s", capture.connect_timeout_s, seconds.clone())?;
         check_range("capture.step_timeout_s", capture.step_timeout_s, seconds.clone())?;
         capture.camera.validate().map_err(|e| e.within("capture.camera"))?;

@@ -15,9 +15,9 @@ use crate::capture::source::{FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
 use crate::service::adjustments::{Adjustments, Entry};
 use crate::service::alignment_stamps::AlignmentStamps;
-use crate::service::brighten::Brightened;
 use crate::service::clock::elapsed_nanos;
 use crate::service::config::MapConfig;
+use crate::service::corrected::{Corrected, Corrections};
 use crate::service::given_pose::{given_pose, truth_in_first_camera};
 use crate::service::map_folder::session::{MapSession, MapSessionError};
 use crate::service::read_ahead::{ReadAhead, ReadingPlan};
@@ -60,7 +60,7 @@ pub enum DepthOrigin {
 }
 
 /// What to replay and how.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct ReplayConfig {
     /// Parameters of the tracker.
     pub tracker: TrackerParams,
@@ -76,26 +76,10 @@ pub struct ReplayConfig {
     pub max_frames: Option<usize>,
     /// Whether an unusable image ends the replay; otherwise it is left out and counted.
     pub strict: bool,
-    /// Whether dim images are brightened.
-    pub brighten: bool,
+    /// What is corrected in the images.
+    pub corrections: Corrections,
     /// Which pixels show the scene; `None` for all.
     pub mask: Option<Mask>,
-}
-
-impl Default for ReplayConfig {
-    fn default() -> Self {
-        Self {
-            tracker: TrackerParams::default(),
-            mapper: MapperParams::default(),
-            map: MapConfig::default(),
-            poses: PoseOrigin::default(),
-            initial_depth: DepthOrigin::default(),
-            max_frames: None,
-            strict: false,
-            brighten: true,
-            mask: None,
-        }
-    }
 }
 
 /// Progress after a frame, for an observer.
@@ -187,7 +171,7 @@ pub fn replay(
     };
     let begin = Instant::now();
     let mut refused = RefusedImages::default();
-    let mut source = Brightened::new(source, config.brighten, config.mask.clone());
+    let mut source = Corrected::new(source, &config.corrections, config.mask.clone());
     let fault = std::thread::scope(|scope| {
         let frames = ReadAhead::start(scope, &mut source, plan).map_err(ReplayError::Thread)?;
         replay.run(&frames, total, &mut refused, observe)

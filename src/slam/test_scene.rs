@@ -206,6 +206,15 @@ impl Scene {
         })
     }
 
+    /// The image of a camera that exposes row after row, each with its own pose, rounded.
+    pub fn rolling(&self, camera: &Intrinsics, world_from_row: impl Fn(usize) -> SE3) -> Vec<u8> {
+        let row = |v: usize| {
+            let row = Intrinsics { height: 1, cy: camera.cy - v as f64, ..*camera };
+            self.cast(&row, &world_from_row(v)).noisy(0.0, 0)
+        };
+        (0..camera.height).flat_map(row).collect()
+    }
+
     fn cast(&self, camera: &Intrinsics, world_from_camera: &SE3) -> Rendering {
         let rotation = world_from_camera.rotation_matrix();
         let origin = world_from_camera.translation;

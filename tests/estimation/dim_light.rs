@@ -4,6 +4,7 @@ use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::{MotionKind, MotionParams, SimulatorParams};
 use semidense::capture::source::{FrameSource, FrameStamp};
 use semidense::capture::source_error::SourceError;
+use semidense::service::corrected::Corrections;
 use semidense::service::replay::{ReplayConfig, replay};
 use semidense::service::results::record::RunRecord;
 use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
@@ -52,7 +53,8 @@ fn dimly_lit(brighten: bool) -> (usize, Option<f64>) {
     let motion = MotionParams { kind: MotionKind::Handheld, ..MotionParams::default() };
     let params = SimulatorParams { frames: 150, motion, ..SimulatorParams::half_size() };
     let mut source = Dimmed(Simulator::new(params).unwrap());
-    let config = ReplayConfig { brighten, ..ReplayConfig::default() };
+    let corrections = Corrections { brighten, ..Corrections::default() };
+    let config = ReplayConfig { corrections, ..ReplayConfig::default() };
     let record = replay(&mut source, "dim", &config, &mut |_| true).unwrap();
     tracked_and_error(&record)
 }

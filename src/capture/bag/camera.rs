@@ -31,7 +31,18 @@ pub fn rig_of(camera: &CameraInfo, topic: &str, path: &Path) -> Result<Rig, Stri
         (false, false) => (LensModel::Radtan, coefficients, [fx, fy, cx, cy]),
     };
     let (width, height) = (camera.width as usize, camera.height as usize);
-    let file = RigFile { model, width, height, fx, fy, cx, cy, coefficients, rate_hz: None };
+    let file = RigFile {
+        model,
+        width,
+        height,
+        fx,
+        fy,
+        cx,
+        cy,
+        coefficients,
+        rate_hz: None,
+        readout_ms: 0.0,
+    };
     file.rig_of(path).map_err(|error| error.to_string())
 }
 

@@ -119,6 +119,12 @@ impl CameraModel {
         })
     }
 
+    /// A camera without distortion, whose intrinsics are valid.
+    pub fn undistorted(intrinsics: Intrinsics) -> Self {
+        let distortion = Distortion::None;
+        Self { intrinsics, distortion, limit: rising_limit(&distortion) }
+    }
+
     /// Intrinsics of the raw image.
     pub fn intrinsics(&self) -> &Intrinsics {
         &self.intrinsics

@@ -1,5 +1,5 @@
-//! A source whose dim images are brightened as they are read, and whose mask hides what is not the scene. That images
-//! are dim is logged in any case.
+//! A source whose images are corrected as they are read: dim ones are brightened, the rolling shutter is undone, and a
+//! mask hides what is not the scene. That images are dim is logged in any case.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -9,19 +9,38 @@ use std::os::fd::BorrowedFd;
 use crate::capture::mask::{Mask, mark_hidden};
 use crate::capture::source::{Arrival, FrameLosses, FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
+use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::brightening::{Brightening, Light, SETTLING_FRAMES};
 use crate::slam::image::buffer::Image;
+use crate::slam::rolling_shutter::RollingShutter;
 use crate::slam::trajectory::StampedPose;
 
-/// The frames of a source, brightened where they are dim. While its first frames are dim it reads a few ahead, to see
-/// whether the exposure still settles.
-pub(crate) struct Brightened<S> {
+/// What is corrected in the images of a source.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Corrections {
+    /// Whether dim images are brightened.
+    pub brighten: bool,
+    /// Time in which all rows are read out, seconds; 0 is a global shutter, `None` what the rig says.
+    pub readout_s: Option<f64>,
+}
+
+impl Default for Corrections {
+    fn default() -> Self {
+        Self { brighten: true, readout_s: None }
+    }
+}
+
+/// The frames of a source, corrected. While its first frames are dim it reads a few ahead, to see whether the exposure
+/// still settles; with a rolling shutter it reads the second before it returns the first.
+pub(crate) struct Corrected<S> {
     source: S,
-    /// Whether frames are changed; otherwise their light is only measured.
-    is_on: bool,
+    /// Whether dim frames are brightened; otherwise their light is only measured.
+    brightens: bool,
     mask: Option<Mask>,
     brightening: Brightening,
+    /// `None` where all rows are exposed together.
+    rolling_shutter: Option<RollingShutter>,
     /// Largest factor so far.
     max_factor: u8,
     /// Frames that were read ahead, in order.
@@ -40,18 +59,34 @@ impl AheadFrame {
     }
 }
 
-impl<S> Brightened<S>
+impl<S> Corrected<S>
 where
     S: DerefMut + Send,
     S::Target: FrameSource,
 {
-    /// Brightens the frames of `source` if that `is_on`, and hides the pixels of `mask`.
-    pub fn new(source: S, is_on: bool, mask: Option<Mask>) -> Self {
+    /// Corrects the frames of `source`, and hides the pixels of `mask`.
+    pub fn new(source: S, corrections: &Corrections, mask: Option<Mask>) -> Self {
+        let of_source = source.readout_s();
+        let readout_s = of_source.map_or(0.0, |of_rig| corrections.readout_s.unwrap_or(of_rig));
+        let rolling_shutter = (readout_s > 0.0).then(|| {
+            tracing::info!(
+                "rolling shutter: undone, rows are read out in {:.1} ms",
+                1e3 * readout_s
+            );
+            RollingShutter::new(&source.camera(), &source.intrinsics(), readout_s)
+        });
         if let Some(mask) = &mask {
             tracing::info!("the mask hides {:.0} % of the image", 100.0 * mask.hidden());
         }
-        let (brightening, ahead) = (Brightening::default(), VecDeque::new());
-        Self { source, is_on, mask, brightening, max_factor: 1, ahead }
+        Self {
+            source,
+            brightens: corrections.brighten,
+            mask,
+            brightening: Brightening::default(),
+            rolling_shutter,
+            max_factor: 1,
+            ahead: VecDeque::new(),
+        }
     }
 
     /// Reads the source's next frame; what is hidden is black, so that it does not count as light.
@@ -63,18 +98,41 @@ where
 
     /// The largest factor by which grey levels were multiplied; `None` where brightening is off.
     pub fn max_factor(&self) -> Option<u8> {
-        self.is_on.then_some(self.max_factor)
+        self.brightens.then_some(self.max_factor)
     }
 
-    /// Whether another frame must be read before the next one is brightened.
+    /// Whether another frame must be read before the next one is corrected.
     fn needs_more(&self) -> bool {
         let width = self.source.intrinsics().width;
         let is_dim = |first: &AheadFrame| first.light(width).is_some_and(|light| light.is_dim());
-        self.is_on
+        let light_settles = self.brightens
             && !self.brightening.has_begun()
             && self.ahead.len() < SETTLING_FRAMES
-            && self.ahead.front().is_none_or(is_dim)
+            && self.ahead.front().is_none_or(is_dim);
+        // The motion of the first image is measured to the second.
+        let lacks_second = self.ahead.len() < 2
+            && self.rolling_shutter.as_ref().is_some_and(|shutter| !shutter.has_begun());
+        (light_settles || lacks_second)
             && self.ahead.back().is_none_or(|last| matches!(last.stamp, Ok(Some(_))))
+    }
+
+    /// Undoes the rolling shutter of a frame.
+    fn undo_rolling_shutter(&mut self, capture_nanos: i64, pixels: &mut [u8]) {
+        let Some(shutter) = &mut self.rolling_shutter else { return };
+        if !shutter.has_begun()
+            && let Some(AheadFrame { stamp: Ok(Some(next)), pixels: next_pixels }) =
+                self.ahead.front()
+        {
+            let mut second = next_pixels.clone();
+            if self.brightens {
+                self.brightening.apply(&mut second);
+            }
+            if !self.source.marks_hidden() {
+                mark_hidden(self.mask.as_ref(), &mut second);
+            }
+            shutter.look_ahead((capture_nanos, pixels), (next.capture_nanos, &second));
+        }
+        shutter.undo(capture_nanos, pixels);
     }
 
     fn read_ahead(&mut self) {
@@ -90,7 +148,7 @@ where
         let later = self.ahead.iter().rev().find_map(|frame| frame.light(width));
         let before = self.brightening.factor();
         self.brightening.follow(pixels, width, later);
-        if self.is_on {
+        if self.brightens {
             self.brightening.apply(pixels);
         }
         let factor = self.brightening.factor();
@@ -98,7 +156,7 @@ where
         match factor {
             _ if factor == before => {}
             1 => tracing::info!("the images are bright enough again"),
-            _ if self.is_on => tracing::warn!(
+            _ if self.brightens => tracing::warn!(
                 "the images are dim; their grey levels are multiplied by {factor}. Add light or expose longer"
             ),
             // Where it is off only the first step is worth a line.
@@ -110,13 +168,17 @@ where
     }
 }
 
-impl<S> FrameSource for Brightened<S>
+impl<S> FrameSource for Corrected<S>
 where
     S: DerefMut + Send,
     S::Target: FrameSource,
 {
     fn intrinsics(&self) -> Intrinsics {
         self.source.intrinsics()
+    }
+
+    fn camera(&self) -> CameraModel {
+        self.source.camera()
     }
 
     fn rectified(&self, raw: &[u8]) -> Vec<u8> {
@@ -168,18 +230,21 @@ where
             }
             None => self.read_into(pixels)?,
         };
-        if stamp.is_some() {
+        if let Some(stamp) = &stamp {
             self.brighten(pixels);
             // Afterwards, so that black is not brightened.
             if !self.source.marks_hidden() {
                 mark_hidden(self.mask.as_ref(), pixels);
             }
+            // Last, as it leaves margins without data.
+            self.undo_rolling_shutter(stamp.capture_nanos, pixels);
         }
         Ok(stamp)
     }
 
     fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
         self.ahead.clear();
+        self.rolling_shutter.iter_mut().for_each(RollingShutter::restart);
         self.source.skip_to(sequence)
     }
 
@@ -205,6 +270,7 @@ mod tests {
     use std::os::fd::AsFd;
 
     use super::*;
+    use crate::capture::looped::Looped;
     use crate::slam::image::NO_DATA;
     use crate::slam::test_scene::CAMERA;
 
@@ -231,16 +297,16 @@ mod tests {
         }
     }
 
-    fn brightened(greys: impl IntoIterator<Item = Option<u8>>) -> Brightened<Box<Greys>> {
-        Brightened::new(
+    fn brightened(greys: impl IntoIterator<Item = Option<u8>>) -> Corrected<Box<Greys>> {
+        Corrected::new(
             Box::new(Greys { greys: greys.into_iter().collect(), num_read: 0 }),
-            true,
+            &Corrections::default(),
             None,
         )
     }
 
     /// Number and grey level of the next frame.
-    fn next(source: &mut Brightened<Box<Greys>>) -> Option<(u64, u8)> {
+    fn next(source: &mut Corrected<Box<Greys>>) -> Option<(u64, u8)> {
         let mut pixels = vec![0; CAMERA.width * CAMERA.height];
         source.next_into(&mut pixels).unwrap().map(|stamp| (stamp.sequence, pixels[0]))
     }
@@ -260,7 +326,7 @@ mod tests {
     #[test]
     fn brightening_that_is_off_changes_nothing_and_reads_nothing_ahead() {
         let mut source = brightened(vec![Some(30); 3]);
-        source.is_on = false;
+        source.brightens = false;
         assert_eq!(next(&mut source), Some((0, 30)));
         assert_eq!((source.source.num_read, source.max_factor()), (1, None));
     }
@@ -329,5 +395,42 @@ mod tests {
         let mut source = brightened(vec![Some(30), Some(0), Some(30)]);
         assert_eq!(next(&mut source), Some((0, 120)));
         assert_eq!(next(&mut source), Some((1, NO_DATA + 1)));
+    }
+
+    #[test]
+    fn a_rolling_shutter_reads_the_second_frame_before_the_first_is_returned() {
+        let rolling = |greys: Vec<Option<u8>>| {
+            let corrections = Corrections { readout_s: Some(0.02), ..Corrections::default() };
+            Corrected::new(Box::new(Greys { greys, num_read: 0 }), &corrections, None)
+        };
+        let mut source = rolling(vec![Some(100); 4]);
+        assert_eq!(next(&mut source), Some((0, 100)));
+        assert_eq!(source.source.num_read, 2);
+        for sequence in 1..4 {
+            assert_eq!(next(&mut source), Some((sequence, 100)));
+            assert_eq!(source.source.num_read as u64, sequence.max(1) + 1);
+        }
+        assert_eq!(next(&mut source), None);
+        // The only frame, and one before a damaged frame, are not waited with.
+        assert_eq!(next(&mut rolling(vec![Some(100)])), Some((0, 100)));
+        let mut source = rolling(vec![Some(100), None, Some(100)]);
+        assert_eq!(next(&mut source), Some((0, 100)));
+        assert!(source.next_into(&mut vec![0; CAMERA.width * CAMERA.height]).is_err());
+        assert_eq!(next(&mut source), Some((2, 100)));
+    }
+
+    #[test]
+    fn frames_that_have_been_corrected_are_not_corrected_again() {
+        let corrections = Corrections { readout_s: Some(0.02), ..Corrections::default() };
+        let looped = |num_frames| {
+            let inner = Box::new(Greys { greys: vec![Some(100); 3], num_read: 0 });
+            Looped::new("loop:4:30:sim".parse().unwrap(), inner, num_frames, 30.0)
+        };
+        let source = Corrected::new(Box::new(looped(4)), &corrections, None);
+        assert!(source.rolling_shutter.is_none());
+        let plain = Box::new(Greys { greys: vec![Some(100); 3], num_read: 0 });
+        assert!(Corrected::new(plain, &corrections, None).rolling_shutter.is_some());
+        let plain = Box::new(Greys { greys: vec![Some(100); 3], num_read: 0 });
+        assert!(Corrected::new(plain, &Corrections::default(), None).rolling_shutter.is_none());
     }
 }

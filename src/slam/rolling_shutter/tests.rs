@@ -1,0 +1,218 @@
+//! Known motions, and rows of a turning camera rendered one by one.
+
+use nalgebra::{UnitQuaternion, Vector3};
+
+use super::*;
+use crate::slam::geometry::camera_model::Distortion;
+use crate::slam::geometry::rectification::rectified_intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::image::{NO_DATA, raise_black};
+use crate::slam::test_scene::{CAMERA, Scene};
+
+/// Time between two images, seconds.
+const PERIOD_S: f64 = 1.0 / 30.0;
+/// Time in which all rows are read out.
+const READOUT_S: f64 = 0.025;
+
+/// A camera that turns with a constant rate about all axes and moves forwards.
+fn pose(time_s: f64) -> SE3 {
+    let turn = Vector3::new(0.5, -1.0, 0.8) * time_s;
+    let place = Vector3::new(0.0, 0.0, 0.2 * time_s);
+    SE3 { rotation: UnitQuaternion::from_scaled_axis(turn), translation: place }
+}
+
+/// The view at an instant.
+fn global(time_s: f64) -> Vec<u8> {
+    Scene::new(1).render(&CAMERA, &pose(time_s)).noisy(0.0, 1)
+}
+
+/// What a camera sees whose rows are exposed one after another, the middle one at `time_s`.
+fn rolling(time_s: f64) -> Vec<u8> {
+    let height = CAMERA.height as f64;
+    let offset_s = |v: usize| ((v as f64 + 0.5) / height - 0.5) * READOUT_S;
+    Scene::new(1).rolling(&CAMERA, |v| pose(time_s + offset_s(v)))
+}
+
+fn shutter(readout_s: f64) -> RollingShutter {
+    RollingShutter::new(&CameraModel::undistorted(CAMERA), &CAMERA, readout_s)
+}
+
+fn nanos(time_s: f64) -> i64 {
+    (time_s * 1e9).round() as i64
+}
+
+/// Mean absolute difference of the pixels with data.
+fn difference(one: &[u8], other: &[u8]) -> f64 {
+    let seen = one.iter().zip(other).filter(|(one, other)| **one.min(other) != NO_DATA);
+    let sum = seen.clone().map(|(one, other)| f64::from(one.abs_diff(*other))).sum::<f64>();
+    sum / seen.count() as f64
+}
+
+fn times(count: usize) -> impl Iterator<Item = f64> {
+    (0..count).map(|i| 1.0 + i as f64 * PERIOD_S)
+}
+
+#[test]
+fn a_rotation_and_a_zoom_are_measured_whatever_the_light() {
+    let mut estimator = MotionEstimator::new(&CAMERA);
+    let mut pyramid = SumPyramid::with_size(CAMERA.width, CAMERA.height, MAX_LEVELS, 1);
+    let scene = Scene::new(2);
+    let turn = Vector3::new(0.02, -0.05, 0.03);
+    let turned = SE3 { rotation: UnitQuaternion::from_scaled_axis(turn), ..SE3::identity() };
+    let zoomed = Intrinsics { fx: 1.03 * CAMERA.fx, fy: 1.03 * CAMERA.fy, ..CAMERA };
+    pyramid.fill(&scene.render(&CAMERA, &turned).noisy(2.0, 1));
+    assert_eq!(estimator.follow(&pyramid, None), None);
+    // The scene turns the other way: the directions of the first image, seen in the second.
+    let mut pixels = scene.render(&zoomed, &SE3::identity()).noisy(2.0, 2);
+    pixels.iter_mut().for_each(|grey| *grey = (f32::from(*grey) * 0.8 + 10.0) as u8);
+    pyramid.fill(&pixels);
+    let [x, y, z, zoom] = estimator.follow(&pyramid, None).unwrap();
+    let error = (Vector3::new(x, y, z) - turn).norm();
+    assert!(error < 1e-3, "{x} {y} {z}");
+    assert!((zoom - 0.03).abs() < 1e-3, "{zoom}");
+    // Light that grows fourfold, as when images are brightened, and falls again.
+    for factor in [4.0f32, 0.25] {
+        pixels.iter_mut().for_each(|grey| *grey = (f32::from(*grey) * factor) as u8);
+        if factor > 1.0 {
+            pyramid.fill(&pixels.iter().map(|grey| grey / 4).collect::<Vec<_>>());
+            estimator.follow(&pyramid, None);
+        }
+        pyramid.fill(&pixels);
+        let motion = estimator.follow(&pyramid, None).unwrap();
+        assert!(motion.iter().all(|value| value.abs() < 1e-3), "{motion:?}");
+    }
+    // Neither another scene nor a covered lens has moved.
+    pixels.reverse();
+    pyramid.fill(&pixels);
+    assert_eq!(estimator.follow(&pyramid, None), None);
+    pyramid.fill(&vec![40; pixels.len()]);
+    assert_eq!(estimator.follow(&pyramid, None), None);
+}
+
+#[test]
+fn the_image_of_a_turning_camera_is_as_if_exposed_at_once() {
+    let mut shutter = shutter(READOUT_S);
+    for (index, time_s) in times(3).enumerate() {
+        let seen = rolling(time_s);
+        let mut undone = seen.clone();
+        shutter.undo(nanos(time_s), &mut undone);
+        let truth = global(time_s);
+        let (before, after) = (difference(&seen, &truth), difference(&undone, &truth));
+        match index {
+            0 => assert_eq!(seen, undone, "the first image's motion is unknown"),
+            _ => assert!(after < 0.2 * before, "image {index}: {before} -> {after}"),
+        }
+        let without_data = undone.iter().filter(|&&grey| grey == NO_DATA).count();
+        assert!(without_data < undone.len() / 30, "{without_data}");
+    }
+}
+
+#[test]
+fn the_first_image_is_undone_if_the_second_is_known() {
+    let mut shutter = shutter(READOUT_S);
+    let [first, second] = [1.0, 1.0 + PERIOD_S].map(|time_s| (nanos(time_s), rolling(time_s)));
+    shutter.look_ahead((first.0, &first.1), (second.0, &second.1));
+    assert!(!shutter.has_begun());
+    let mut undone = first.1.clone();
+    shutter.undo(first.0, &mut undone);
+    assert!(shutter.has_begun());
+    let truth = global(1.0);
+    let (before, after) = (difference(&first.1, &truth), difference(&undone, &truth));
+    assert!(after < 0.25 * before, "{before} -> {after}");
+    // Later ones are not undone by it.
+    let mut blank = vec![128; first.1.len()];
+    shutter.undo(second.0, &mut blank);
+    assert!(blank.iter().all(|&grey| grey == 128 || grey == NO_DATA));
+}
+
+#[test]
+fn a_repeated_image_is_undone_as_before() {
+    let mut shutter = shutter(READOUT_S);
+    let mut results = Vec::new();
+    for (index, time_s) in times(3).enumerate() {
+        let seen = rolling(time_s);
+        for repeat in 0..2 {
+            let mut undone = seen.clone();
+            shutter.undo(nanos(time_s + f64::from(repeat) * 0.5 * PERIOD_S), &mut undone);
+            results.push((index, undone));
+        }
+    }
+    for pair in results.chunks_exact(2) {
+        assert!(pair[0].1 == pair[1].1, "image {}", pair[0].0);
+    }
+    assert!(results[4].1 != rolling(1.0 + 2.0 * PERIOD_S));
+}
+
+#[test]
+fn after_a_pause_and_after_a_cut_nothing_is_undone() {
+    for (pause_s, seed) in [(MAX_INTERVAL_S + 0.01, 1), (PERIOD_S, 9), (-PERIOD_S, 1)] {
+        let mut shutter = shutter(READOUT_S);
+        for time_s in times(2) {
+            shutter.undo(nanos(time_s), &mut rolling(time_s));
+        }
+        let mut next = Scene::new(seed).render(&CAMERA, &pose(1.2)).noisy(2.0, 1);
+        if seed == 9 {
+            next.reverse();
+        }
+        let before = next.clone();
+        shutter.undo(nanos(1.0 + PERIOD_S + pause_s), &mut next);
+        assert!(next == before, "after {pause_s} s, scene {seed}");
+    }
+}
+
+#[test]
+fn images_without_content_and_of_another_size_are_left_alone() {
+    let mut shutter = shutter(READOUT_S);
+    for (index, grey) in [0, 1, 128, 255, 0].into_iter().enumerate() {
+        let mut pixels = vec![grey; CAMERA.width * CAMERA.height];
+        shutter.undo(nanos(index as f64 * PERIOD_S), &mut pixels);
+        assert!(pixels.iter().all(|&found| found == grey), "{grey}");
+    }
+    let mut small = vec![7; 12];
+    shutter.undo(0, &mut small);
+    assert_eq!(small, [7; 12]);
+}
+
+#[test]
+fn pixels_beside_hidden_ones_have_no_data() {
+    let rows = RowTimes::new(&CameraModel::undistorted(CAMERA), &CAMERA, READOUT_S);
+    let mut seen = global(1.0);
+    raise_black(&mut seen);
+    let hidden = 200 * CAMERA.width + 160;
+    seen[hidden] = NO_DATA;
+    let mut undone = seen.clone();
+    rows.resample(&[0.0, 0.01, 0.0, 0.0], &seen, &mut undone);
+    let row = &undone[200 * CAMERA.width + 150..][..20];
+    let place = |u: usize| row[u - 150] == NO_DATA;
+    assert_eq!((150..170).filter(|&u| place(u)).collect::<Vec<_>>(), [159, 160]);
+    // A camera at rest changes nothing.
+    seen[hidden] = 99;
+    rows.resample(&ImageMotion::default(), &seen, &mut undone);
+    assert!(undone == seen);
+}
+
+#[test]
+fn rows_are_those_of_the_raw_image() {
+    let lens = Distortion::try_equidistant(&[0.02, -0.003, 0.0, 0.0]).unwrap();
+    let raw = Intrinsics { fx: 120.0, fy: 120.0, ..CAMERA };
+    let camera = CameraModel::new(raw, lens).unwrap();
+    let rectified = rectified_intrinsics(&camera).unwrap();
+    let rows = RowTimes::new(&camera, &rectified, READOUT_S);
+    // In the image's corner, where the lens bends rows most, a turn about the vertical moves the image by its rate
+    // times the time since the middle of the read-out.
+    let (u, v) = (10, 10);
+    let ray = rectified.ray(u as f64, v as f64);
+    let middle = 0.5 * (raw.height - 1) as f64;
+    let raw_row = camera.project(&ray).unwrap().y - middle;
+    let bend = raw_row - (v as f64 - middle);
+    assert!(bend.abs() > 20.0, "{bend}");
+    let rate = 0.1;
+    let time_s = raw_row * READOUT_S / raw.height as f64;
+    let expected = u as f64 + rectified.fx * rate * time_s * (1.0 + ray.x * ray.x);
+    let ramp = |at: usize| (20 + at % CAMERA.width / 2) as u8;
+    let seen = (0..CAMERA.width * CAMERA.height).map(ramp).collect::<Vec<_>>();
+    let mut undone = seen.clone();
+    rows.resample(&[0.0, rate, 0.0, 0.0], &seen, &mut undone);
+    let found = 2.0 * (f64::from(undone[v * CAMERA.width + u]) - 20.0);
+    assert!((found - expected).abs() < 2.0, "{found}, {expected}");
+}
