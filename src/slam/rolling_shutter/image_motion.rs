@@ -143,9 +143,10 @@ impl MotionEstimator {
         for level in (0..coarsest).rev() {
             state = self.solve(level, state.0)?;
         }
-        let (State { rotation, zoom, .. }, explained) = state;
+        let (State { rotation, zoom, gain, .. }, explained) = state;
         let turn = rotation.scaled_axis();
-        (explained >= MIN_EXPLAINED).then_some([turn.x, turn.y, turn.z, zoom])
+        let is_seen = explained >= MIN_EXPLAINED && 1.0 + gain >= f64::from(MIN_CONTRAST);
+        is_seen.then_some([turn.x, turn.y, turn.z, zoom])
     }
 
     /// Iterates on one level; returns where it ends, and the share of the image's variance that it explains.
