@@ -2,7 +2,7 @@
 //! resampled as if all rows had been exposed with the middle one.
 //!
 //! What moves the image most, rotation and motion at the scene's mean depth, is measured between successive images by
-//! [`image_motion`], before anything is tracked, and undone row by row by [`rows`]. What translation does to surfaces
+//! `image_motion`, before anything is tracked, and undone row by row by `rows`. What translation does to surfaces
 //! nearer or farther than the mean is left: it hardly changes from image to image.
 
 mod image_motion;
