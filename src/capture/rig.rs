@@ -35,7 +35,7 @@ const USUAL_ASPECT: f64 = 1.5;
 /// Allowed frame rates, frames per second.
 const RATE_RANGE: std::ops::RangeInclusive<f64> = 0.1..=1000.0;
 /// Allowed read-out times of all rows, milliseconds; slow webcams need 60.
-const READOUT_RANGE: std::ops::RangeInclusive<f64> = 0.0..=200.0;
+pub const READOUT_MS_RANGE: std::ops::RangeInclusive<f64> = 0.0..=200.0;
 
 /// One camera: lens, intrinsics of the raw image, how long it reads out rows and, if known, its frame rate.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -141,18 +141,7 @@ impl Rig {
         let model = if coefficients.is_empty() { LensModel::Pinhole } else { LensModel::Radtan };
         let (width, height) = (side(width), side(height));
         let coefficients = coefficients.to_vec();
-        let file = RigFile {
-            model,
-            width,
-            height,
-            fx,
-            fy,
-            cx,
-            cy,
-            coefficients,
-            rate_hz: None,
-            readout_ms: 0.0,
-        };
+        let file = RigFile::of_lens(model, [width, height], [fx, fy, cx, cy], coefficients);
         Ok(file.rig_of(path)?)
     }
 
@@ -221,6 +210,17 @@ fn view_deg(focal_px: f64, centre_px: f64, side: usize, is_fisheye: bool) -> f64
 }
 
 impl RigFile {
+    /// A rig that names nothing but the lens: size of the raw image, `[fx, fy, cx, cy]` and coefficients.
+    pub fn of_lens(
+        model: LensModel,
+        [width, height]: [usize; 2],
+        [fx, fy, cx, cy]: [f64; 4],
+        coefficients: Vec<f64>,
+    ) -> Self {
+        let (rate_hz, readout_ms) = (None, 0.0);
+        Self { model, width, height, fx, fy, cx, cy, coefficients, rate_hz, readout_ms }
+    }
+
     /// Checks the values and returns the rig; errors name `path`.
     pub fn rig_of(&self, path: &Path) -> Result<Rig, RigError> {
         self.rig().map_err(|source| RigError::Value { path: path.to_owned(), source })
@@ -265,7 +265,7 @@ impl RigFile {
         if let Some(rate_hz) = self.rate_hz {
             check_range("rate_hz", rate_hz, RATE_RANGE)?;
         }
-        check_range("readout_ms", self.readout_ms, READOUT_RANGE)?;
+        check_range("readout_ms", self.readout_ms, READOUT_MS_RANGE)?;
         let Self { width, height, fx, fy, cx, cy, .. } = *self;
         let count_error = |allowed: &str| ParameterError {
             key: "coefficients".to_owned(),
@@ -374,6 +374,8 @@ mod tests {
             ("radtan", "fov", "line 1: unknown variant `fov`, expected one of"),
             ("cy = 240", "", "missing field `cy`"),
             ("cy = 240", "cy = 240\nvignette = 1", "line 8: unknown field `vignette`"),
+            ("cy = 240", "cy = 240\nreadout_ms = 201", "readout_ms = 201: must be 0 to 200"),
+            ("cy = 240", "cy = 240\nreadout_ms = nan", "readout_ms = NaN: must be 0 to 200"),
             ("cy = 240", "cy 240", "line 7: "),
         ] {
             let text = GOOD.replace(from, to);

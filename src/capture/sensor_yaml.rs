@@ -66,8 +66,8 @@ pub fn parse(path: &Path, text: &str) -> Result<SensorYaml, SourceError> {
     let [fx, fy, cx, cy] = get("intrinsics")?.numbers()?;
     let [width, height] = get("resolution")?.numbers()?.map(side);
     let rate_hz = entries.get("rate_hz").map(|entry| entry.row.number(&entry.value)).transpose()?;
-    let file =
-        RigFile { model, width, height, fx, fy, cx, cy, coefficients, rate_hz, readout_ms: 0.0 };
+    let lens = RigFile::of_lens(model, [width, height], [fx, fy, cx, cy], coefficients);
+    let file = RigFile { rate_hz, ..lens };
     let rig = file.rig_of(path)?;
     let transform = get("T_BS.data")?;
     let body_from_camera = rigid_from_rows(&transform.numbers()?).ok_or_else(|| {

@@ -16,6 +16,7 @@ use toml::{Table, Value};
 
 use crate::capture::input_file;
 use crate::capture::opening::SourceParams;
+use crate::capture::rig::READOUT_MS_RANGE;
 use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::v4l::params::CameraParams;
 pub use crate::service::config::origins::{EffectiveKey, Origin};
@@ -326,7 +327,7 @@ impl Config {
         // More than an hour is a mistaken unit.
         let seconds = 0.1..=3600.0;
         let capture = &self.capture;
-        check_range("capture.readout_ms", capture.readout_ms, 0.0..=200.0)?;
+        check_range("capture.readout_ms", capture.readout_ms, READOUT_MS_RANGE)?;
         check_range("capture.connect_timeout_s", capture.connect_timeout_s, seconds.clone())?;
         check_range("capture.step_timeout_s", capture.step_timeout_s, seconds.clone())?;
         capture.camera.validate().map_err(|e| e.within("capture.camera"))?;

@@ -271,6 +271,7 @@ mod tests {
 
     use super::*;
     use crate::capture::looped::Looped;
+    use crate::capture::tum;
     use crate::slam::image::NO_DATA;
     use crate::slam::test_scene::CAMERA;
 
@@ -417,6 +418,32 @@ mod tests {
         assert_eq!(next(&mut source), Some((0, 100)));
         assert!(source.next_into(&mut vec![0; CAMERA.width * CAMERA.height]).is_err());
         assert_eq!(next(&mut source), Some((2, 100)));
+    }
+
+    #[test]
+    fn a_jump_forgets_the_motion() {
+        let corrections = Corrections { readout_s: Some(0.02), ..Corrections::default() };
+        let greys = Box::new(Greys { greys: vec![Some(100); 9], num_read: 0 });
+        let mut source = Corrected::new(greys, &corrections, None);
+        assert_eq!(next(&mut source), Some((0, 100)));
+        source.skip_to(4).unwrap();
+        assert!(source.rolling_shutter.as_ref().is_some_and(|shutter| !shutter.has_begun()));
+        assert_eq!(next(&mut source), Some((5, 100)));
+    }
+
+    #[test]
+    fn the_rig_s_read_out_time_reaches_the_frames() {
+        let folder = tempfile::tempdir().unwrap();
+        let rig = folder.path().join("rig.toml");
+        std::fs::write(folder.path().join("rgb.txt"), "1.0 rgb/1.png\n").unwrap();
+        let lens = "model = \"pinhole\"\nwidth = 160\nheight = 120\nfx = 130\nfy = 130\ncx = 80\ncy = 60\n";
+        for (key, is_undone) in [("readout_ms = 20", true), ("", false)] {
+            std::fs::write(&rig, format!("{lens}{key}\n")).unwrap();
+            let source = Box::new(tum::open(folder.path(), Some(&rig)).unwrap());
+            assert_eq!(source.readout_s(), Some(if is_undone { 0.02 } else { 0.0 }));
+            let corrected = Corrected::new(source, &Corrections::default(), None);
+            assert_eq!(corrected.rolling_shutter.is_some(), is_undone);
+        }
     }
 
     #[test]

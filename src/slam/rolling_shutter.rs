@@ -84,6 +84,7 @@ impl RollingShutter {
         self.last_nanos = None;
         self.rates = [None; 2];
         self.first = None;
+        self.repeats = Repeats::with_size_of(&self.pyramid);
     }
 
     /// Measures how the first image moves, from the one after it.
@@ -131,19 +132,17 @@ impl RollingShutter {
         let shortest_s = MIN_READOUTS * self.readout_s;
         let interval_s =
             interval_s.filter(|interval_s| (shortest_s..=MAX_INTERVAL_S).contains(interval_s));
-        let predicted = interval_s
-            .zip(self.rates[0])
-            .map(|(interval_s, rate)| rate.per_second.map(|per_second| per_second * interval_s));
-        let motion = self.estimator.follow(&self.pyramid, predicted);
-        let rate = motion.zip(interval_s).map(|(motion, interval_s)| {
+        self.estimator.take(&self.pyramid);
+        let rate = interval_s.and_then(|interval_s| {
+            let predicted =
+                self.rates[0].map(|rate| rate.per_second.map(|per_s| per_s * interval_s));
+            let motion = self.estimator.motion(predicted)?;
             // What moves down is exposed later.
             let exposed_s = (interval_s - self.vertical_s * motion[0]).max(0.5 * interval_s);
-            Rate { per_second: motion.map(|value| value / exposed_s), interval_s }
+            Some(Rate { per_second: motion.map(|value| value / exposed_s), interval_s })
         });
-        self.rates = [rate, self.rates[0]];
-        if self.rates[0].is_none() {
-            self.rates[1] = None;
-        }
+        // A rate is extrapolated only from one right before it.
+        self.rates = [rate, self.rates[0].filter(|_| rate.is_some())];
     }
 
     /// Motion while the last image was exposed: half an interval after the middle of the last one.

@@ -31,18 +31,7 @@ pub fn rig_of(camera: &CameraInfo, topic: &str, path: &Path) -> Result<Rig, Stri
         (false, false) => (LensModel::Radtan, coefficients, [fx, fy, cx, cy]),
     };
     let (width, height) = (camera.width as usize, camera.height as usize);
-    let file = RigFile {
-        model,
-        width,
-        height,
-        fx,
-        fy,
-        cx,
-        cy,
-        coefficients,
-        rate_hz: None,
-        readout_ms: 0.0,
-    };
+    let file = RigFile::of_lens(model, [width, height], [fx, fy, cx, cy], coefficients);
     file.rig_of(path).map_err(|error| error.to_string())
 }
 

@@ -267,6 +267,7 @@ fn a_summary_without_schemas_is_not_trusted() {
     let mut bag = bag.unwrap();
     assert_eq!((bag.num_frames(), bag.take_notice()), (Some(3), None));
     assert!(!bag.marks_hidden(), "in another's bag 0 is black");
+    assert_eq!(bag.readout_s(), Some(0.0));
     assert_eq!(play(&mut bag).0, [(0, 0), (1, 1), (2, 2)]);
 }
 
@@ -287,6 +288,7 @@ fn our_own_recordings_keep_number_stamp_and_exposure() {
     // Rectified by its name: the projection counts, not the lens.
     assert_eq!(bag.intrinsics().fx, 2.0 * K[0]);
     assert!(bag.marks_hidden());
+    assert_eq!(bag.readout_s(), None, "its frames are as published");
     let mut pixels = vec![0; PIXELS];
     let mut found = Vec::new();
     while let Some(stamp) = bag.next_into(&mut pixels).unwrap() {

@@ -295,6 +295,17 @@ fn comment_of(text: &str, key: &str) -> String {
 }
 
 #[test]
+fn a_read_out_time_of_the_configuration_comes_before_the_rig_s() {
+    let readout_s = |settings: &[&str]| set(settings).unwrap().capture.corrections().readout_s;
+    assert_eq!(readout_s(&[]), None);
+    assert_eq!(readout_s(&["capture.readout_ms=20"]), Some(0.02));
+    let off = "capture.undo_rolling_shutter=false";
+    assert_eq!(readout_s(&[off]), Some(0.0));
+    assert_eq!(readout_s(&["capture.readout_ms=20", off]), Some(0.0));
+    assert!(!set(&["capture.brighten=false"]).unwrap().capture.corrections().brighten);
+}
+
+#[test]
 fn spread_points_are_fused_without_support_around_them() {
     let params = |filter: &str| {
         let config = set(&[&format!("mapping.depth_filter={filter}")]).unwrap();

@@ -44,8 +44,8 @@ pub(crate) fn value(grey: u8) -> f32 {
     if grey == NO_DATA { f32::NAN } else { f32::from(grey) }
 }
 
-/// 2×2 mean.
-fn halve(fine: &Image<f32>, coarse: &mut Image<f32>) {
+/// 2×2 mean; NaN where one of them is.
+pub(crate) fn halve(fine: &Image<f32>, coarse: &mut Image<f32>) {
     let width = coarse.width();
     for (v, row) in coarse.pixels_mut().chunks_exact_mut(width).enumerate() {
         let (upper, lower) = (fine.row(2 * v), fine.row(2 * v + 1));

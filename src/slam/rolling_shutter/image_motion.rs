@@ -6,6 +6,7 @@ use nalgebra::{Matrix3, Matrix6, Rotation3, Vector3, Vector6};
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
+use crate::slam::image::pyramid::halve;
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid, grey_per_sum};
 
 /// Rotation vector, radians, and relative change of the image's scale: directions of the first image rotated by it, and
@@ -38,6 +39,9 @@ const HUBER: f32 = 1.5;
 /// Standard deviation of a Gaussian distribution over its mean absolute value.
 const STD_DEV_PER_MEAN: f32 = 1.2533;
 
+/// Least standard deviation of residuals, grey levels: rounding.
+const MIN_STD_DEV: f32 = 0.1;
+
 /// Least share of the pixels with data that both images see.
 const MIN_IN_VIEW: f64 = 0.5;
 
@@ -65,20 +69,6 @@ pub struct MotionEstimator {
     cameras: Vec<Intrinsics>,
     last: Levels,
     now: Levels,
-    has_last: bool,
-}
-
-/// The normal equations of one iteration.
-struct System {
-    hessian: Matrix6<f64>,
-    gradient: Vector6<f64>,
-    /// Pixels of the last image with data.
-    num_with_data: usize,
-    /// Pixels in both images, their absolute residuals, and their weighted squared residuals and deviations.
-    num_pixels: usize,
-    absolute: f64,
-    squared: f64,
-    deviation: f64,
 }
 
 /// What is estimated.
@@ -105,16 +95,11 @@ impl MotionEstimator {
             .map(|(_, camera)| camera)
             .collect();
         let images = || cameras.iter().map(|k| Image::filled(k.width, k.height, 0.0)).collect();
-        Self { finest, last: images(), now: images(), has_last: false, cameras }
+        Self { finest, last: images(), now: images(), cameras }
     }
 
-    /// Takes the next image; returns the motion since the last one, or `None` if it cannot be measured. `predicted` is
-    /// where the search begins, beside no motion.
-    pub fn follow(
-        &mut self,
-        pyramid: &SumPyramid,
-        predicted: Option<ImageMotion>,
-    ) -> Option<ImageMotion> {
+    /// Takes the next image.
+    pub fn take(&mut self, pyramid: &SumPyramid) {
         std::mem::swap(&mut self.last, &mut self.now);
         let factor = grey_per_sum(self.finest);
         let sums = pyramid.level(self.finest).pixels();
@@ -125,21 +110,17 @@ impl MotionEstimator {
             let (fine, coarse) = self.now.split_at_mut(level);
             halve(&fine[level - 1], &mut coarse[0]);
         }
-        if !std::mem::replace(&mut self.has_last, true) {
-            return None;
-        }
+    }
+
+    /// The motion between the last two images, `None` if it cannot be measured. `predicted` is where the search begins,
+    /// beside no motion.
+    pub fn motion(&self, predicted: Option<ImageMotion>) -> Option<ImageMotion> {
         // The coarsest level decides where to begin.
         let coarsest = self.cameras.len() - 1;
         let from = |start| self.solve(coarsest, State::from_motion(start));
-        let at_rest = from(ImageMotion::default());
-        let mut state = match (at_rest, predicted.filter(|start| *start != ImageMotion::default()))
-        {
-            (at_rest, None) => at_rest?,
-            (at_rest, Some(start)) => match (at_rest, from(start)) {
-                (Some(at_rest), Some(moving)) if moving.1 > at_rest.1 => moving,
-                (at_rest, moving) => at_rest.or(moving)?,
-            },
-        };
+        let ends = [Some(ImageMotion::default()), predicted].map(|start| from(start?));
+        let ends = ends.into_iter().flatten();
+        let mut state = ends.max_by(|one, other| one.1.total_cmp(&other.1))?;
         for level in (0..coarsest).rev() {
             state = self.solve(level, state.0)?;
         }
@@ -154,20 +135,17 @@ impl MotionEstimator {
         let mut std_dev = f32::INFINITY;
         let mut explained = 0.0;
         for _ in 0..MAX_ITERATIONS {
-            let system = self.linearise(level, &state, HUBER * std_dev);
-            let least = MIN_IN_VIEW * system.num_with_data as f64;
-            if system.num_pixels == 0 || (system.num_pixels as f64) < least {
+            let sums = self.linearise(level, &state, HUBER * std_dev);
+            let num_pixels = sums.num_pixels as f64;
+            if sums.num_pixels == 0 || num_pixels < MIN_IN_VIEW * sums.num_with_data as f64 {
                 return None;
             }
-            // In grey levels of the new image.
-            let deviation = system.deviation * (1.0 + state.gain).powi(2);
-            explained = 1.0 - system.squared / deviation.max(f64::MIN_POSITIVE);
-            let mean = (system.absolute / system.num_pixels as f64) as f32;
-            std_dev = (STD_DEV_PER_MEAN * mean).max(0.1);
+            explained = sums.explained(state.gain);
+            std_dev = (STD_DEV_PER_MEAN * (sums.absolute / num_pixels) as f32).max(MIN_STD_DEV);
             let variance = f64::from(std_dev).powi(2);
-            let prior =
-                Matrix6::from_diagonal(&Vector6::from(PRIOR_STD_DEV.map(|s| variance / (s * s))));
-            let step = -(system.hessian + prior).cholesky()?.solve(&system.gradient);
+            let prior = PRIOR_STD_DEV.map(|prior| variance / (prior * prior));
+            let hessian = sums.hessian() + Matrix6::from_diagonal(&Vector6::from(prior));
+            let step = -hessian.cholesky()?.solve(&sums.gradient());
             state.update(&step);
             let moved_px = step.fixed_rows::<4>(0).amax() * self.cameras[level].fx;
             if moved_px < MIN_STEP_PX
@@ -182,7 +160,7 @@ impl MotionEstimator {
 
     /// Compares the images of a level, the last one moved by `state`. The derivative is that of the last image, which
     /// the step moves first, in the light of the new one.
-    fn linearise(&self, level: usize, state: &State, limit: f32) -> System {
+    fn linearise(&self, level: usize, state: &State, limit: f32) -> Sums {
         let k = &self.cameras[level];
         let (last, now) = (&self.last[level], &self.now[level]);
         let [fx, fy, cx, cy] = [k.fx, k.fy, k.cx, k.cy].map(|value| value as f32);
@@ -196,6 +174,7 @@ impl MotionEstimator {
         for v in (1..k.height - 1).step_by(row_step) {
             let (above, row, below) = (last.row(v - 1), last.row(v), last.row(v + 1));
             let y = (v as f32 - cy) / fy;
+            let mut products = [0.0; NUM_PRODUCTS];
             for u in 1..k.width - 1 {
                 if row[u].is_nan() {
                     continue;
@@ -214,90 +193,83 @@ impl MotionEstimator {
                 let gradient_v = 0.5 * contrast * fy * (below[u] - above[u]);
                 let residual =
                     now.bilinear(seen_u, seen_v) - MIDDLE_GREY - (1.0 + gain) * grey - offset;
-                let jacobian = [
+                // Anything without data makes it NaN.
+                if (residual + gradient_u + gradient_v).is_nan() {
+                    continue;
+                }
+                let terms = [
                     -gradient_u * x * y - gradient_v * (1.0 + y * y),
                     gradient_u * (1.0 + x * x) + gradient_v * x * y,
                     gradient_v * x - gradient_u * y,
                     gradient_u * x + gradient_v * y,
                     -grey,
                     -1.0,
+                    residual,
                 ];
-                // Anything without data makes it NaN.
-                if (residual + gradient_u + gradient_v).is_nan() {
-                    continue;
-                }
-                let weight = (limit / residual.abs()).min(1.0);
-                sums.add(&jacobian, residual, weight, grey);
+                add_products(&mut products, &terms, (limit / residual.abs()).min(1.0));
+                sums.absolute += f64::from(residual.abs());
+                sums.num_pixels += 1;
+            }
+            for (sum, row) in sums.products.iter_mut().zip(products) {
+                *sum += f64::from(row);
             }
         }
-        sums.system()
+        sums
     }
 }
 
-/// 2×2 mean.
-fn halve(fine: &Image<f32>, coarse: &mut Image<f32>) {
-    let width = coarse.width();
-    for (v, row) in coarse.pixels_mut().chunks_exact_mut(width).enumerate() {
-        let (upper, lower) = (fine.row(2 * v), fine.row(2 * v + 1));
-        for (u, out) in row.iter_mut().enumerate() {
-            *out = 0.25 * (upper[2 * u] + upper[2 * u + 1] + lower[2 * u] + lower[2 * u + 1]);
+/// Derivatives by what is estimated, and the residual.
+const NUM_TERMS: usize = 7;
+
+/// Products of two of them.
+const NUM_PRODUCTS: usize = NUM_TERMS * (NUM_TERMS + 1) / 2;
+
+/// Adds the weighted products of all pairs of terms.
+#[inline(always)]
+fn add_products(sums: &mut [f32; NUM_PRODUCTS], terms: &[f32; NUM_TERMS], weight: f32) {
+    let mut index = 0;
+    for i in 0..NUM_TERMS {
+        let weighted = weight * terms[i];
+        for &other in &terms[i..] {
+            sums[index] += weighted * other;
+            index += 1;
         }
     }
 }
 
-/// Sums over pixels.
+/// Sums over the pixels of a level; products of terms in double precision from row to row.
 #[derive(Default)]
 struct Sums {
-    hessian: [f64; 21],
-    gradient: [f64; 6],
-    num_with_data: usize,
-    num_pixels: usize,
+    products: [f64; NUM_PRODUCTS],
+    /// Absolute residuals.
     absolute: f64,
-    squared: f64,
-    weight: f64,
-    grey: f64,
-    grey_squared: f64,
+    /// Pixels in both images.
+    num_pixels: usize,
+    /// Pixels of the last image with data.
+    num_with_data: usize,
 }
 
 impl Sums {
-    fn add(&mut self, jacobian: &[f32; 6], residual: f32, weight: f32, grey: f32) {
-        let mut index = 0;
-        for i in 0..6 {
-            let weighted = weight * jacobian[i];
-            for &other in &jacobian[i..] {
-                self.hessian[index] += f64::from(weighted * other);
-                index += 1;
-            }
-            self.gradient[i] += f64::from(weighted * residual);
-        }
-        self.num_pixels += 1;
-        self.absolute += f64::from(residual.abs());
-        self.squared += f64::from(weight * residual * residual);
-        self.weight += f64::from(weight);
-        self.grey += f64::from(weight * grey);
-        self.grey_squared += f64::from(weight * grey * grey);
+    /// Sum of the products of terms `i` and `j`, the lower first.
+    fn product(&self, i: usize, j: usize) -> f64 {
+        self.products[i * NUM_TERMS - i * (i + 1) / 2 + j]
     }
 
-    fn system(&self) -> System {
-        let mut hessian = Matrix6::zeros();
-        let mut index = 0;
-        for i in 0..6 {
-            for j in i..6 {
-                hessian[(i, j)] = self.hessian[index];
-                hessian[(j, i)] = self.hessian[index];
-                index += 1;
-            }
-        }
-        let mean = self.grey / self.weight.max(f64::MIN_POSITIVE);
-        System {
-            hessian,
-            gradient: Vector6::from(self.gradient),
-            num_with_data: self.num_with_data,
-            num_pixels: self.num_pixels,
-            absolute: self.absolute,
-            squared: self.squared,
-            deviation: self.grey_squared - mean * self.grey,
-        }
+    fn hessian(&self) -> Matrix6<f64> {
+        Matrix6::from_fn(|i, j| self.product(i.min(j), i.max(j)))
+    }
+
+    fn gradient(&self) -> Vector6<f64> {
+        Vector6::from_fn(|i, _| self.product(i, 6))
+    }
+
+    /// Share of the new image's variance that is explained, if its contrast is that of the last one times 1 + `gain`.
+    fn explained(&self, gain: f64) -> f64 {
+        // The derivatives by gain and offset are the grey level and 1, negated.
+        let (weight, grey, grey_squared) =
+            (self.product(5, 5), self.product(4, 5), self.product(4, 4));
+        let deviation = grey_squared - grey * grey / weight.max(f64::MIN_POSITIVE);
+        1.0 - self.product(6, 6) / (deviation * (1.0 + gain).powi(2)).max(f64::MIN_POSITIVE)
     }
 }
 

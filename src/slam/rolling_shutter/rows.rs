@@ -58,20 +58,18 @@ impl RowTimes {
             for node in 1..nodes.len() {
                 let (begin, end) = (nodes[node - 1], nodes[node]);
                 let to = seen(node);
-                let step = [0, 1].map(|i| (to[i] - from[i]) / (end - begin) as i32);
-                let mut place = from;
-                for out in &mut out[begin..end] {
-                    *out = sampler.at(place);
-                    place = [place[0] + step[0], place[1] + step[1]];
+                match from.zip(to) {
+                    Some((from, to)) => sampler.line(from, to, &mut out[begin..end]),
+                    None => out[begin..end].fill(NO_DATA),
                 }
                 from = to;
             }
-            out[width - 1] = sampler.at(from);
+            out[width - 1] = from.map_or(NO_DATA, |place| sampler.at(place));
         }
     }
 
-    /// Where in the rolling image the scene of a pixel is seen, in steps of 2⁻¹⁶ pixels.
-    fn seen_at(&self, motion: &ImageMotion, [u, v]: [usize; 2], raw_row: f32) -> [i32; 2] {
+    /// Where in the rolling image the scene of a pixel is seen, in steps of 2⁻¹⁶ pixels; `None` far out of view.
+    fn seen_at(&self, motion: &ImageMotion, [u, v]: [usize; 2], raw_row: f32) -> Option<[i32; 2]> {
         let Intrinsics { fx, fy, cx, cy, .. } = self.rectified;
         let [fx, fy, cx, cy] = [fx, fy, cx, cy].map(|value| value as f32);
         let [wx, wy, wz, zoom] = motion.map(|value| value as f32);
@@ -86,14 +84,14 @@ impl RowTimes {
         let half = 0.5 * time_s * time_s;
         let depth = 1.0 + time_s * dz + half * ez;
         if depth.is_nan() || depth < MIN_DEPTH {
-            return [MAX_PLACE as i32 * ONE; 2];
+            return None;
         }
         let scale = (1.0 + time_s * zoom) / depth;
         let seen_u = fx * scale * (x + time_s * dx + half * ex) + cx;
         let seen_v = fy * scale * (y + time_s * dy + half * ey) + cy;
-        // Any coordinate that is out of reach is out of view.
-        [seen_u, seen_v]
-            .map(|place| (place.clamp(-MAX_PLACE, MAX_PLACE) * ONE as f32).round() as i32)
+        let seen = [seen_u, seen_v];
+        let is_near = seen.iter().all(|place| place.abs() < MAX_PLACE);
+        is_near.then(|| seen.map(|place| (place * ONE as f32).round() as i32))
     }
 }
 
@@ -105,6 +103,17 @@ struct Sampler<'a> {
 }
 
 impl Sampler<'_> {
+    /// Samples at equal distances from `from` towards `to`, which is the place of the pixel after the last.
+    #[inline]
+    fn line(&self, from: [i32; 2], to: [i32; 2], out: &mut [u8]) {
+        let step = [0, 1].map(|i| (to[i] - from[i]) / out.len() as i32);
+        let mut place = from;
+        for out in out {
+            *out = self.at(place);
+            place = [place[0] + step[0], place[1] + step[1]];
+        }
+    }
+
     /// Bilinear, at a place in steps of 2⁻¹⁶ pixels; no data outside and beside pixels without data.
     #[inline]
     fn at(&self, place: [i32; 2]) -> u8 {

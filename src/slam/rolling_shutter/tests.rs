@@ -61,12 +61,13 @@ fn a_rotation_and_a_zoom_are_measured_whatever_the_light() {
     let turned = SE3 { rotation: UnitQuaternion::from_scaled_axis(turn), ..SE3::identity() };
     let zoomed = Intrinsics { fx: 1.03 * CAMERA.fx, fy: 1.03 * CAMERA.fy, ..CAMERA };
     pyramid.fill(&scene.render(&CAMERA, &turned).noisy(2.0, 1));
-    assert_eq!(estimator.follow(&pyramid, None), None);
+    estimator.take(&pyramid);
     // The scene turns the other way: the directions of the first image, seen in the second.
     let mut pixels = scene.render(&zoomed, &SE3::identity()).noisy(2.0, 2);
     pixels.iter_mut().for_each(|grey| *grey = (f32::from(*grey) * 0.8 + 10.0) as u8);
     pyramid.fill(&pixels);
-    let [x, y, z, zoom] = estimator.follow(&pyramid, None).unwrap();
+    estimator.take(&pyramid);
+    let [x, y, z, zoom] = estimator.motion(None).unwrap();
     let error = (Vector3::new(x, y, z) - turn).norm();
     assert!(error < 1e-3, "{x} {y} {z}");
     assert!((zoom - 0.03).abs() < 1e-3, "{zoom}");
@@ -76,20 +77,23 @@ fn a_rotation_and_a_zoom_are_measured_whatever_the_light() {
         pixels.iter_mut().for_each(|grey| *grey = (f32::from(*grey) * factor) as u8);
         if factor > 1.0 {
             pyramid.fill(&pixels.iter().map(|grey| grey / 4).collect::<Vec<_>>());
-            estimator.follow(&pyramid, None);
+            estimator.take(&pyramid);
         }
         pyramid.fill(&pixels);
-        let motion = estimator.follow(&pyramid, None).unwrap();
+        estimator.take(&pyramid);
+        let motion = estimator.motion(None).unwrap();
         assert!(motion.iter().all(|value| value.abs() < 1e-3), "{motion:?}");
     }
     // Neither another scene nor a covered lens has moved.
     pyramid.fill(&usual);
-    estimator.follow(&pyramid, None);
+    estimator.take(&pyramid);
     usual.reverse();
     pyramid.fill(&usual);
-    assert_eq!(estimator.follow(&pyramid, None), None);
+    estimator.take(&pyramid);
+    assert_eq!(estimator.motion(None), None);
     pyramid.fill(&vec![40; usual.len()]);
-    assert_eq!(estimator.follow(&pyramid, None), None);
+    estimator.take(&pyramid);
+    assert_eq!(estimator.motion(None), None);
 }
 
 #[test]
@@ -147,8 +151,10 @@ fn a_repeated_image_is_undone_as_before() {
 }
 
 #[test]
-fn after_a_pause_and_after_a_cut_nothing_is_undone() {
-    for (pause_s, seed) in [(MAX_INTERVAL_S + 0.01, 1), (PERIOD_S, 9), (-PERIOD_S, 1)] {
+fn after_a_pause_a_burst_of_stamps_and_a_cut_nothing_is_undone() {
+    let pauses_s = [MAX_INTERVAL_S + 0.01, -PERIOD_S, 0.5 * MIN_READOUTS * READOUT_S];
+    let cases = pauses_s.map(|pause_s| (pause_s, 1)).into_iter().chain([(PERIOD_S, 9)]);
+    for (pause_s, seed) in cases {
         let mut shutter = shutter(READOUT_S);
         for time_s in times(2) {
             shutter.undo(nanos(time_s), &mut rolling(time_s));
@@ -161,6 +167,79 @@ fn after_a_pause_and_after_a_cut_nothing_is_undone() {
         shutter.undo(nanos(1.0 + PERIOD_S + pause_s), &mut next);
         assert!(next == before, "after {pause_s} s, scene {seed}");
     }
+}
+
+#[test]
+fn a_rate_that_changes_is_extrapolated_to_the_image() {
+    let mut shutter = shutter(READOUT_S);
+    let rate = |per_second, interval_s| Some(Rate { per_second: [per_second; 4], interval_s });
+    // From the middle of 0.04 s to the middle of 0.02 s it grew by 0.3, within 0.03 s; the image is 0.01 s later.
+    shutter.rates = [rate(1.3, 0.02), rate(1.0, 0.04)];
+    assert!(shutter.motion_per_second().unwrap().iter().all(|value| (value - 1.4).abs() < 1e-12));
+    shutter.rates = [rate(1.3, 0.02), None];
+    assert_eq!(shutter.motion_per_second(), Some([1.3; 4]));
+}
+
+#[test]
+fn a_pitch_is_measured_over_the_time_between_exposures() {
+    // What moves along the rows' order is exposed later in the second image.
+    let rate = 2.0;
+    let height = CAMERA.height as f64;
+    let seen = |time_s: f64| {
+        Scene::new(1).rolling(&CAMERA, |v| {
+            let row_s = time_s + ((v as f64 + 0.5) / height - 0.5) * READOUT_S;
+            let rotation = UnitQuaternion::from_scaled_axis(Vector3::x() * rate * row_s);
+            SE3 { rotation, ..SE3::identity() }
+        })
+    };
+    let mut shutter = shutter(READOUT_S);
+    for time_s in [0.0, PERIOD_S] {
+        shutter.undo(nanos(time_s), &mut seen(time_s));
+    }
+    let measured = shutter.rates[0].unwrap().per_second[0];
+    assert!((measured + rate).abs() < 0.02 * rate, "{measured}");
+}
+
+#[test]
+fn a_motion_that_no_camera_makes_is_not_undone() {
+    let mut shutter = shutter(READOUT_S);
+    let seen = rolling(1.0);
+    shutter.undo(nanos(1.0), &mut seen.clone());
+    for (per_second, is_undone) in [(0.5, true), (1.1 * MAX_MOTION / READOUT_S, false)] {
+        shutter.rates =
+            [Some(Rate { per_second: [0.0, per_second, 0.0, 0.0], interval_s: PERIOD_S }), None];
+        let mut undone = seen.clone();
+        // A repeated image does not change the rate.
+        shutter.undo(nanos(1.0), &mut undone);
+        assert_eq!(undone != seen, is_undone, "{per_second}");
+    }
+    // Places that cannot be computed are out of view.
+    let rows = RowTimes::new(&CameraModel::undistorted(CAMERA), &CAMERA, READOUT_S);
+    for value in [f64::NAN, f64::INFINITY, 1e30, -1e6] {
+        for axis in 0..4 {
+            let mut motion = ImageMotion::default();
+            motion[axis] = value;
+            let mut undone = seen.clone();
+            rows.resample(&motion, &seen, &mut undone);
+            let top = &undone[..CAMERA.width];
+            assert!(top.iter().all(|&grey| grey == NO_DATA), "{axis}: {value}");
+        }
+    }
+}
+
+#[test]
+fn after_a_restart_nothing_is_known() {
+    let mut shutter = shutter(READOUT_S);
+    for time_s in times(2) {
+        shutter.undo(nanos(time_s), &mut rolling(time_s));
+    }
+    shutter.restart();
+    assert!(!shutter.has_begun());
+    // Even the last image again is a first one.
+    let seen = rolling(1.0 + PERIOD_S);
+    let mut undone = seen.clone();
+    shutter.undo(nanos(1.0 + PERIOD_S), &mut undone);
+    assert!(undone == seen && shutter.has_begun());
 }
 
 #[test]
