@@ -93,6 +93,8 @@ pub struct CaptureConfig {
     pub undo_rolling_shutter: bool,
     /// Time in which the camera reads out all rows, milliseconds; 0 is what the rig says.
     pub readout_ms: f64,
+    /// Whether the vignette of the lens is estimated and undone.
+    pub undo_vignette: bool,
     /// Longest wait for tracker and mapper to get ready before a recording starts, seconds.
     pub connect_timeout_s: f64,
     /// Lockstep: longest wait for a frame to enter the map, seconds.
@@ -113,6 +115,7 @@ impl Default for CaptureConfig {
             brighten: true,
             undo_rolling_shutter: true,
             readout_ms: 0.0,
+            undo_vignette: true,
             connect_timeout_s: 30.0,
             step_timeout_s: 60.0,
             scheduling: SchedulingParams { priority: 80, ..SchedulingParams::default() },
@@ -126,7 +129,7 @@ impl CaptureConfig {
     pub fn corrections(&self) -> Corrections {
         let configured_s = (self.readout_ms > 0.0).then_some(1e-3 * self.readout_ms);
         let readout_s = if self.undo_rolling_shutter { configured_s } else { Some(0.0) };
-        Corrections { brighten: self.brighten, readout_s }
+        Corrections { brighten: self.brighten, readout_s, undo_vignette: self.undo_vignette }
     }
 }
 

@@ -113,7 +113,8 @@ impl Odometry {
     /// Tracks the next frame and returns its pose. Sequence and stamp must increase; a frame of another size is not
     /// tracked. Until the camera has moved sideways by some per cent of the distance of the scene there is no map, and
     /// poses are `Initializing`. Grey levels are taken as given: brighten a dim camera's frames with
-    /// [`Brightening`](crate::slam::image::brightening::Brightening) first.
+    /// [`Brightening`](crate::slam::image::brightening::Brightening), and undo a lens' dark corners with
+    /// [`Vignette`](crate::slam::vignette::Vignette), first.
     pub fn push(&mut self, frame: &FrameView<'_>) -> PoseEstimate {
         if self.params.zero_is_hidden || !frame.pixels.contains(&NO_DATA) {
             return self.push_marked(frame);

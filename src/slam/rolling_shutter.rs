@@ -5,7 +5,6 @@
 //! `image_motion`, before anything is tracked, and undone row by row by `rows`. What translation does to surfaces
 //! nearer or farther than the mean is left: it hardly changes from image to image.
 
-mod image_motion;
 mod rows;
 #[cfg(test)]
 mod tests;
@@ -14,7 +13,7 @@ use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::repeats::{Repeats, Shown};
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid};
-use crate::slam::rolling_shutter::image_motion::{ImageMotion, MotionEstimator};
+use crate::slam::image_motion::{ImageMotion, MotionEstimator};
 use crate::slam::rolling_shutter::rows::RowTimes;
 
 /// Longest interval over which a motion is measured, seconds: five frames at 20 Hz.

@@ -303,6 +303,8 @@ fn a_read_out_time_of_the_configuration_comes_before_the_rig_s() {
     assert_eq!(readout_s(&[off]), Some(0.0));
     assert_eq!(readout_s(&["capture.readout_ms=20", off]), Some(0.0));
     assert!(!set(&["capture.brighten=false"]).unwrap().capture.corrections().brighten);
+    let undone = |settings: &[&str]| set(settings).unwrap().capture.corrections().undo_vignette;
+    assert!(undone(&[]) && !undone(&["capture.undo_vignette=false"]));
 }
 
 #[test]

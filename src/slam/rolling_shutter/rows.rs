@@ -3,7 +3,7 @@
 use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::NO_DATA;
-use crate::slam::rolling_shutter::image_motion::ImageMotion;
+use crate::slam::image_motion::ImageMotion;
 
 /// One pixel, in the steps of a place.
 const ONE: i32 = 1 << 16;

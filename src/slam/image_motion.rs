@@ -2,6 +2,9 @@
 //! translation at the scene's mean depth. Estimated directly from grey levels, from coarse to fine, with a gain and an
 //! offset.
 
+#[cfg(test)]
+mod tests;
+
 use nalgebra::{Matrix3, Matrix6, Rotation3, Vector3, Vector6};
 
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -128,6 +131,11 @@ impl MotionEstimator {
         let turn = rotation.scaled_axis();
         let is_seen = explained >= MIN_EXPLAINED && 1.0 + gain >= f64::from(MIN_CONTRAST);
         is_seen.then_some([turn.x, turn.y, turn.z, zoom])
+    }
+
+    /// The finest level: its intrinsics, and the grey levels of the last image and the new one, NaN without data.
+    pub(crate) fn finest(&self) -> (&Intrinsics, &Image<f32>, &Image<f32>) {
+        (&self.cameras[0], &self.last[0], &self.now[0])
     }
 
     /// Iterates on one level; returns where it ends, and the share of the image's variance that it explains.
