@@ -11,6 +11,7 @@ mod tests;
 use nalgebra::{Matrix3, Rotation3, SMatrix, SVector, Vector3};
 
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::image::repeats::{Repeats, Shown};
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid};
 use crate::slam::image_motion::{ImageMotion, MotionEstimator};
 
@@ -52,8 +53,8 @@ const MAX_FACTOR: f64 = 4.0;
 /// Bits after the point of a factor.
 const FRACTION_BITS: u32 = 8;
 
-/// Logarithm of the light at a squared distance from the principal point, 1 in the farthest corner, as the coefficients
-/// of its powers.
+/// Logarithm of the light, as the coefficients of powers of the squared distance from the principal point, 1 in the
+/// farthest corner.
 type Coefficients = Vector3<f64>;
 
 /// Estimates and undoes the vignette of one lens, image after image.
@@ -80,7 +81,10 @@ enum Stage {
 #[derive(Debug)]
 struct Estimate {
     pyramid: SumPyramid,
+    repeats: Repeats,
     motion: MotionEstimator,
+    /// Squared distance of the image's farthest corner.
+    corner: f64,
     information: Matrix3<f64>,
     vector: Vector3<f64>,
 }
@@ -88,8 +92,11 @@ struct Estimate {
 impl Vignette {
     /// For rectified images with these intrinsics.
     pub fn new(intrinsics: &Intrinsics) -> Self {
+        let pyramid = SumPyramid::with_size(intrinsics.width, intrinsics.height, MAX_LEVELS, 1);
         let estimate = Estimate {
-            pyramid: SumPyramid::with_size(intrinsics.width, intrinsics.height, MAX_LEVELS, 1),
+            repeats: Repeats::with_size_of(&pyramid),
+            pyramid,
+            corner: farthest_corner(intrinsics),
             motion: MotionEstimator::new(intrinsics),
             information: Matrix3::from_diagonal_element(PRIOR_STD_DEV.powi(-2)),
             vector: Vector3::zeros(),
@@ -102,23 +109,29 @@ impl Vignette {
     /// corners if from now on it is undone. Does nothing once that is decided.
     pub fn follow(&mut self, pixels: &[u8]) -> Option<f64> {
         let Stage::Estimated(estimate) = &mut self.stage else { return None };
-        let place = self.num_images % PERIOD;
-        self.num_images += 1;
         if pixels.len() != self.intrinsics.width * self.intrinsics.height {
             return None;
         }
         estimate.pyramid.fill(pixels);
-        estimate.motion.take(&estimate.pyramid);
-        if place == 1 {
-            estimate.compare();
-            return self.decide();
+        // A repeated image shows no motion.
+        if estimate.repeats.observe(&estimate.pyramid) == Shown::Repeat {
+            return None;
         }
-        None
+        estimate.motion.take(&estimate.pyramid);
+        self.num_images += 1;
+        if !self.num_images.is_multiple_of(PERIOD) {
+            return None;
+        }
+        estimate.compare();
+        self.decide()
     }
 
     /// Forgets the last image, as before a jump in the source.
     pub fn restart(&mut self) {
         self.num_images = 0;
+        if let Stage::Estimated(estimate) = &mut self.stage {
+            estimate.repeats = Repeats::with_size_of(&estimate.pyramid);
+        }
     }
 
     /// Undoes it, if it is known and large enough.
@@ -154,7 +167,7 @@ impl Vignette {
             self.stage = Stage::Even;
             return None;
         }
-        let light = (-loss).exp();
+        let light = (-loss).exp().max(MAX_FACTOR.recip());
         let factors = factors(&self.intrinsics, &coefficients);
         self.stage = Stage::Undone { factors, light };
         Some(light)
@@ -170,18 +183,23 @@ fn powers(squared: f64) -> Vector3<f64> {
     Vector3::new(squared, squared * squared, squared.powi(3))
 }
 
-/// Squared distance of a pixel from the principal point, 1 in the farthest corner.
-fn squared_distance(camera: &Intrinsics) -> impl Fn(f64, f64) -> f64 {
-    let (cx, cy) = (camera.cx, camera.cy);
-    let far_u = cx.max(camera.width as f64 - 1.0 - cx);
-    let far_v = cy.max(camera.height as f64 - 1.0 - cy);
-    let corner = far_u * far_u + far_v * far_v;
-    move |u, v| ((u - cx) * (u - cx) + (v - cy) * (v - cy)) / corner
+/// Squared distance of the image's farthest corner from the principal point, in focal lengths.
+fn farthest_corner(camera: &Intrinsics) -> f64 {
+    let far = |center: f64, side: usize| center.max(side as f64 - 1.0 - center);
+    let x = far(camera.cx, camera.width) / camera.fx;
+    let y = far(camera.cy, camera.height) / camera.fy;
+    x * x + y * y
+}
+
+/// Squared distance of a pixel of any level from the principal point, 1 in the image's farthest corner.
+fn squared_distance(camera: &Intrinsics, corner: f64) -> impl Fn(f64, f64) -> f64 {
+    let Intrinsics { fx, fy, cx, cy, .. } = *camera;
+    move |u, v| (((u - cx) / fx).powi(2) + ((v - cy) / fy).powi(2)) / corner
 }
 
 /// Factors on grey levels, as integers.
 fn factors(camera: &Intrinsics, coefficients: &Coefficients) -> Vec<u16> {
-    let squared = squared_distance(camera);
+    let squared = squared_distance(camera, farthest_corner(camera));
     let one = f64::from(1_u32 << FRACTION_BITS);
     let factor = |(u, v): (usize, usize)| {
         let light = logarithm(coefficients, squared(u as f64, v as f64)).exp();
@@ -197,29 +215,34 @@ impl Estimate {
     /// Adds what the last two images tell.
     fn compare(&mut self) {
         let Some(motion) = self.motion.motion(None) else { return };
-        let coefficients = self.coefficients();
-        // The first pass finds gain and offset, and how well the images agree; the second counts what does not less.
-        let Some((first, num_compared)) = self.products(&motion, |_| 1.0) else { return };
-        let Some(light) = light_of(&first, &coefficients) else { return };
+        // The first pass finds how well the images agree; the second counts what does not less.
+        let Some((first, num_compared)) = self.products(&motion, 1.0, |_| 1.0) else { return };
+        let before = self.coefficients();
+        let Some((coefficients, light)) = light_of(&first, &before).and_then(|light| {
+            let scale = scale(deviation(&first, &before, &light) / num_compared as f64);
+            let (information, vector) = without_light(&first)?;
+            let information = self.information + scale * information;
+            let coefficients = information.cholesky()?.solve(&(self.vector + scale * vector));
+            Some((coefficients, light_of(&first, &coefficients)?))
+        }) else {
+            return;
+        };
         let variance = deviation(&first, &coefficients, &light) / num_compared as f64;
         let limit = HUBER * variance.max(f64::MIN_POSITIVE).sqrt();
+        let gain = light.x;
+        // The gain is in the derivatives by the coefficients too.
         let state =
-            SVector::<f64, 5>::from_fn(|i, _| if i < 3 { coefficients[i] } else { light[i - 3] });
+            SVector::from([coefficients.x, coefficients.y, coefficients.z, light.x, light.y]);
         let weight = |terms: &SVector<f64, 6>| {
             (limit / (terms[5] - terms.fixed_rows::<5>(0).dot(&state)).abs()).min(1.0)
         };
-        let Some((products, _)) = self.products(&motion, weight) else { return };
-        let scale = 1.0 / (variance.max(1.0) * PIXELS_PER_ERROR);
-        // Gain and offset are eliminated.
-        let of_light = products.fixed_view::<2, 2>(3, 3).into_owned();
-        let Some(of_light) = of_light.try_inverse() else { return };
-        let cross = products.fixed_view::<3, 2>(0, 3).into_owned() * of_light;
-        let information =
-            products.fixed_view::<3, 3>(0, 0) - cross * products.fixed_view::<2, 3>(3, 0);
-        let vector = products.fixed_view::<3, 1>(0, 5) - cross * products.fixed_view::<2, 1>(3, 5);
+        let products = self.products(&motion, gain, weight);
+        let Some((information, vector)) = products.and_then(|(of, _)| without_light(&of)) else {
+            return;
+        };
         if information.iter().chain(vector.iter()).all(|value| value.is_finite()) {
-            self.information += scale * information;
-            self.vector += scale * vector;
+            self.information += scale(variance) * information;
+            self.vector += scale(variance) * vector;
         }
     }
 
@@ -228,17 +251,19 @@ impl Estimate {
     }
 
     /// Sums over the pixels that both images see, each as if its grey level had a standard deviation of 1, times
-    /// `weight`; and their number.
+    /// `weight`; and their number. `gain` is that of the derivatives by the coefficients.
     fn products(
         &self,
         motion: &ImageMotion,
+        gain: f64,
         weight: impl Fn(&SVector<f64, 6>) -> f64,
     ) -> Option<(Products, usize)> {
         let (k, last, now) = self.motion.finest();
         let rotation = Rotation3::from_scaled_axis(Vector3::new(motion[0], motion[1], motion[2]));
         let scale = 1.0 + motion[3];
-        let squared = squared_distance(k);
-        let (right, bottom) = ((k.width - 1) as f64, (k.height - 1) as f64);
+        let squared = squared_distance(k, self.corner);
+        // Samples beyond would be clamped.
+        let [right, bottom] = [k.width, k.height].map(|side| side.saturating_sub(2) as f64);
         let mut products = Products::zeros();
         let mut num_compared = 0;
         for v in 1..k.height - 1 {
@@ -267,7 +292,7 @@ impl Estimate {
                 let inverse_std_dev = f64::from(variance.sqrt().recip());
                 let grey = f64::from(row[u]);
                 let to = powers(squared(seen_u, seen_v));
-                let change = grey * (to - powers(squared(u as f64, v as f64)));
+                let change = gain * grey * (to - powers(squared(u as f64, v as f64)));
                 let terms = inverse_std_dev
                     * SVector::from([change.x, change.y, change.z, grey, 1.0, f64::from(seen)]);
                 products += weight(&terms) * terms * terms.transpose();
@@ -276,6 +301,20 @@ impl Estimate {
         }
         (num_compared >= MIN_COMPARED).then_some((products, num_compared))
     }
+}
+
+/// Weight of a comparison whose pixels have this variance, times that expected.
+fn scale(variance: f64) -> f64 {
+    1.0 / (variance.max(1.0) * PIXELS_PER_ERROR)
+}
+
+/// Information on the coefficients, with gain and offset eliminated.
+fn without_light(products: &Products) -> Option<(Matrix3<f64>, Vector3<f64>)> {
+    let of_light = products.fixed_view::<2, 2>(3, 3).try_inverse()?;
+    let cross = products.fixed_view::<3, 2>(0, 3) * of_light;
+    let information = products.fixed_view::<3, 3>(0, 0) - cross * products.fixed_view::<2, 3>(3, 0);
+    let vector = products.fixed_view::<3, 1>(0, 5) - cross * products.fixed_view::<2, 1>(3, 5);
+    Some((information, vector))
 }
 
 /// Gain and offset that fit best with these coefficients.

@@ -1,7 +1,6 @@
 //! Effects of a real camera on the image: changes of exposure, noise, motion blur. With all of them the simulated room
-//! is still tracked without a loss, at less than twice the error. A rolling shutter and a vignette are undone. The cost of
-//! each effect alone is printed by
-//! `cargo test --release --test estimation camera_effects -- --ignored --nocapture`.
+//! is still tracked without a loss, at less than twice the error. A rolling shutter is undone. The cost of each effect
+//! alone is printed by `cargo test --release --test estimation camera_effects -- --ignored --nocapture`.
 
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::{MotionParams, SensorParams, SimulatorParams};

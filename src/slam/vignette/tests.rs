@@ -20,7 +20,7 @@ fn seen(place: u32, speed: f64, light: fn(f64) -> f64) -> Vec<u8> {
     let translation = Vector3::new(0.0, 0.05 * time, 0.1 * time.sin());
     let pose = SE3 { rotation: UnitQuaternion::from_scaled_axis(turn), translation };
     let exposure = 0.7 + 0.1 * (0.2 * f64::from(place)).sin();
-    let squared = squared_distance(&CAMERA);
+    let squared = squared_distance(&CAMERA, farthest_corner(&CAMERA));
     let pixels = Scene::new(1).render(&CAMERA, &pose).noisy(2.0, u64::from(place));
     let darkened = |(index, grey): (usize, &u8)| {
         let (u, v) = (index % CAMERA.width, index / CAMERA.width);
@@ -52,7 +52,7 @@ fn a_vignette_is_found_and_undone() {
         let mut undone = raw.clone();
         vignette.undo(&mut undone);
         let ratio = |pixels: &[u8], squared_range: std::ops::Range<f64>| {
-            let squared = squared_distance(&CAMERA);
+            let squared = squared_distance(&CAMERA, farthest_corner(&CAMERA));
             let is_in = |index: usize| {
                 let (u, v) = ((index % CAMERA.width) as f64, (index / CAMERA.width) as f64);
                 squared_range.contains(&squared(u, v))
@@ -89,6 +89,33 @@ fn without_motion_nothing_is_decided() {
     let mut vignette = Vignette::new(&CAMERA);
     assert_eq!(found(&mut vignette, 0.0, lens), None);
     assert!(matches!(vignette.stage, Stage::Estimated(_)));
+}
+
+#[test]
+fn repeated_images_and_steps_of_the_exposure_do_not_matter() {
+    let mut vignette = Vignette::new(&CAMERA);
+    let of = |place: u32| {
+        let mut pixels = seen(place / 2, 0.1, lens);
+        if place / 2 % 2 == 1 {
+            pixels.iter_mut().for_each(|grey| *grey = (0.8 * f64::from(*grey)).round() as u8);
+        }
+        pixels
+    };
+    let light = (0..200).find_map(|place| vignette.follow(&of(place))).unwrap();
+    assert!((light - 0.5).abs() < 0.04, "{light}");
+}
+
+#[test]
+fn a_level_has_the_distances_of_the_image() {
+    let camera = Intrinsics { fy: 0.8 * CAMERA.fy, ..CAMERA };
+    let level = camera.at_level(2);
+    let corner = farthest_corner(&camera);
+    let (of_image, of_level) =
+        (squared_distance(&camera, corner), squared_distance(&level, corner));
+    // Pixel 5 of the level covers pixels 20 to 23.
+    assert!((of_image(21.5, 41.5) - of_level(5.0, 10.0)).abs() < 1e-9);
+    let right = camera.width as f64 - 1.0;
+    assert!((of_image(right, camera.height as f64 - 1.0) - 1.0).abs() < 0.02);
 }
 
 #[test]
