@@ -28,6 +28,7 @@ pub mod params;
 mod pass;
 pub(crate) mod place_marginals;
 mod plane;
+mod realignment;
 mod rival;
 mod selection;
 pub(crate) mod sighting;
