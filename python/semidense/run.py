@@ -173,7 +173,7 @@ class Run:
 
     @cached_property
     def trajectory(self) -> Optional[Trajectory]:
-        """Final pose of every tracked frame, `map_from_camera`."""
+        """Final pose of every tracked frame but those on rejected keyframes, `map_from_camera`."""
         return self._trajectory("trajectory.txt")
 
     @cached_property

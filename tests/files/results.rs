@@ -11,7 +11,7 @@ use semidense::slam::evaluation::epochs::evaluate_epochs;
 use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::graph::constraint::Refusal;
-use semidense::slam::keyframe::Keyframe;
+use semidense::slam::keyframe::{Keyframe, MapState};
 use semidense::slam::loops::{SearchOutcome, SearchReport};
 use semidense::slam::map::{ConfirmedPoint, RealignedFrame};
 use semidense::slam::mapper::consistency::Contradiction;
@@ -46,6 +46,32 @@ fn frames_aligned_afterwards_count_only_if_the_map_was_tracked_on() {
         let lines = std::fs::read_to_string(folder.path().join("out/trajectory.txt")).unwrap();
         assert_eq!(lines.lines().filter(|line| !line.starts_with('#')).count(), tracked);
     }
+}
+
+#[test]
+fn frames_on_a_keyframe_rejected_afterwards_are_left_out_of_the_trajectory() {
+    let poses = (0..50).map(|i| pose(i, TrackingState::Tracking, u64::from(i >= 20))).collect();
+    let mut record = record(poses, vec![keyframe(0), keyframe(1)], true);
+    record.map.keyframes[1].map_state = MapState::Rejected;
+    let (sequence, keyframe_from_camera) = (45, SE3::identity());
+    let aligned = RealignedFrame { sequence, keyframe_id: 1, keyframe_from_camera };
+    record.map.store_frame_pose(&aligned);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("trajectory.txt");
+    let check = |record: &RunRecord, left: &[usize]| {
+        let (summary, _) = written(folder.path(), record);
+        assert_eq!(summary["frames_tracked"], 50);
+        assert_eq!(summary["frames_withdrawn"], 50 - left.iter().sum::<usize>());
+        let found = poses_by_epoch(&path).into_iter().map(|(_, poses)| poses);
+        assert_eq!(found.collect::<Vec<_>>(), left);
+    };
+    // 20 frames on the first keyframe, 30 on the second, of which one was aligned.
+    check(&record, &[21]);
+    // Given poses do not come from the map.
+    check(&RunRecord { depth_scale: DepthScale::Given, ..record.clone() }, &[50]);
+    // An epoch of which nothing stands is marked as another.
+    record.map.keyframes[1].epoch = 1;
+    check(&record, &[20, 30]);
 }
 
 #[test]

@@ -13,14 +13,14 @@ use crate::slam::evaluation::normalized_error::{
     NormalizedErrors, map_normalized_errors, normalized_errors,
 };
 use crate::slam::evaluation::velocity_error::velocity_normalized_errors;
-use crate::slam::keyframe::Keyframe;
+use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::map::Map;
 use crate::slam::pose::PoseEstimate;
 use crate::slam::trajectory::{EpochPose, StampedPose};
 
 /// First line of `trajectory.txt`.
-pub const FINAL_COMMENT: &str =
-    "map_from_camera of every tracked frame: final pose of its keyframe x relative pose";
+pub const FINAL_COMMENT: &str = "map_from_camera of every tracked frame: final pose of its keyframe x \
+    relative pose; without those on rejected keyframes";
 
 /// First line of `trajectory_online.txt`.
 pub const ONLINE_COMMENT: &str = "world_from_camera of every tracked frame as it was published";
@@ -29,6 +29,21 @@ pub const ONLINE_COMMENT: &str = "world_from_camera of every tracked frame as it
 /// separate coordinate frame and scale, so that only one can be compared with ground truth.
 pub fn longest_epoch(record: &RunRecord) -> Option<u32> {
     most_frequent(tracked(record).map(|estimate| final_epoch(record, estimate)))
+}
+
+/// Whether the final trajectory leaves a frame out: its keyframe was rejected afterwards, while others of its epoch
+/// stand, and it was not aligned to their points. Given poses do not depend on the map.
+fn is_withdrawn(record: &RunRecord, estimate: &PoseEstimate) -> bool {
+    let map = &record.map;
+    let is_established = |of: &Keyframe| of.map_state == MapState::Established;
+    let is_on_rejected = |keyframe: &Keyframe| {
+        let of_epoch = |of: &&Keyframe| of.epoch == keyframe.epoch;
+        !is_established(keyframe) && map.keyframes.iter().filter(of_epoch).any(is_established)
+    };
+    estimate.state.is_tracked()
+        && record.depth_scale != DepthScale::Given
+        && map.frame(estimate.sequence).is_none()
+        && map.get(estimate.keyframe_id).is_some_and(is_on_rejected)
 }
 
 /// The epoch that occurs most often, the earliest of equals.
@@ -41,9 +56,9 @@ fn most_frequent(epochs: impl Iterator<Item = u32>) -> Option<u32> {
 }
 
 /// Every frame with a pose, at the final pose of its keyframe in the map, with the epoch that it belongs to in the end:
-/// tracked frames, and frames from before the start of their map that were aligned to it afterwards. A tracked frame
-/// whose keyframe the final map does not hold keeps its published pose. Empty where no frame was tracked on arrival: a
-/// map that began with the last frames is unproven.
+/// tracked frames, except those on a rejected keyframe, and frames from before the start of their map that were
+/// aligned to it afterwards. A tracked frame whose keyframe the final map does not hold keeps its published pose. Empty
+/// where no frame was tracked on arrival: a map that began with the last frames is unproven.
 pub fn final_poses(record: &RunRecord) -> Vec<EpochPose> {
     if !is_any_tracked(&record.poses) {
         return Vec::new();
@@ -51,7 +66,8 @@ pub fn final_poses(record: &RunRecord) -> Vec<EpochPose> {
     let keyframes = record.map.keyframes.iter();
     let places: HashMap<u64, _> = keyframes.map(|k| (k.keyframe_id, k)).collect();
     let estimates = record.poses.iter().map(|pose| &pose.estimate);
-    let with_pose = estimates.filter_map(|estimate| {
+    let kept = estimates.filter(|estimate| !is_withdrawn(record, estimate));
+    let with_pose = kept.filter_map(|estimate| {
         let (keyframe_id, at) = match record.map.frame(estimate.sequence) {
             Some(aligned) => (aligned.keyframe_id, &aligned.keyframe_from_camera),
             None if !estimate.state.is_tracked() => return None,

@@ -174,6 +174,9 @@ pub struct FrameCounts {
     pub frames_tracked_later: u64,
     /// Those of them whose pose is worse than it should be.
     pub frames_degraded: u64,
+    /// Tracked frames whose keyframe was rejected afterwards: `trajectory.txt` leaves them out.
+    #[serde(default)]
+    pub frames_withdrawn: u64,
     /// Frames without a pose from before the map could be trusted.
     pub frames_initializing: u64,
     /// Frames without a pose because tracking was lost.
@@ -181,16 +184,19 @@ pub struct FrameCounts {
 }
 
 impl FrameCounts {
-    fn of(poses: &[RecordedPose], map: &Map) -> Self {
-        let states = || poses.iter().map(|pose| pose.estimate.state);
+    fn of(record: &RunRecord) -> Self {
+        let states = || record.poses.iter().map(|pose| pose.estimate.state);
         let count = |is: fn(TrackingState) -> bool| states().filter(|of| is(*of)).count() as u64;
-        let later: Vec<TrackingState> = placed_later(poses, map).map(|of| of.state).collect();
+        let later: Vec<TrackingState> =
+            placed_later(&record.poses, &record.map).map(|of| of.state).collect();
         let without_pose = |is: fn(TrackingState) -> bool| {
             count(is) - later.iter().filter(|state| is(**state)).count() as u64
         };
+        let frames_tracked = count(TrackingState::is_tracked) + later.len() as u64;
         Self {
-            frames_tracked: count(TrackingState::is_tracked) + later.len() as u64,
+            frames_tracked,
             frames_tracked_later: later.len() as u64,
+            frames_withdrawn: frames_tracked - final_poses(record).len() as u64,
             frames_degraded: count(|s| matches!(s, TrackingState::Degraded(_))),
             frames_initializing: without_pose(|s| s == TrackingState::Initializing),
             frames_lost: without_pose(is_lost),
@@ -346,7 +352,7 @@ impl Summary {
             frames_refused: counters.frames_refused,
             refused: record.refused.clone(),
             brightened_by: counters.brightened_by,
-            frames: FrameCounts::of(&record.poses, &record.map),
+            frames: FrameCounts::of(record),
             frames_dropped: record.frames_dropped,
             gaps: counters.gaps,
             lost_count: count_losses(&record.poses),
@@ -409,7 +415,7 @@ fn grade(record: &RunRecord) -> Grade {
     let sequences = record.poses.iter().map(|pose| pose.estimate.sequence);
     let (first, last) = (sequences.clone().min(), sequences.max());
     let frames = last.zip(first).map_or(0, |(last, first)| last - first + 1);
-    let counts = FrameCounts::of(&record.poses, &record.map);
+    let counts = FrameCounts::of(record);
     // A map that was left for another one on request is no separate part of that.
     let first_epoch = record.loaded_map.as_ref().map_or(0, |loaded| loaded.first_epoch);
     Grade::of(&GradeInput {

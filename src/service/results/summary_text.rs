@@ -25,7 +25,7 @@ pub fn summary_text(summary: &Summary) -> String {
     lines.add("restarts", restarts.map(|of| format!("{} {}: {}", of.count, of.process, of.cause)));
     let rejections = summary.map_rejections.iter().flatten();
     let rejected = |of: &Rejection| format!("map at frame {}: {}", of.sequence, of.reason);
-    lines.add("rejected", rejections.map(rejected));
+    lines.add("rejected", rejections.map(rejected).chain(withdrawn(summary)));
     lines.add("errors", evaluated(summary));
     lines.add("trajectory", trajectory_errors(&summary.trajectory));
     lines.add("online", trajectory_errors(&summary.online));
@@ -71,6 +71,13 @@ fn map(summary: &Summary) -> String {
         summary.point_counts.map_points,
         summary.epoch
     )
+}
+
+/// Frames that were tracked on keyframes rejected afterwards; `None` without any.
+fn withdrawn(summary: &Summary) -> Option<String> {
+    let frames = Some(summary.frames.frames_withdrawn).filter(|&frames| frames > 0)?;
+    let frames = counted(frames, "frame");
+    Some(format!("{frames} on rejected keyframes, left out of trajectory.txt"))
 }
 
 /// Whether there is a map that no frame has confirmed: it began with the last frames, was lost at once, or the camera

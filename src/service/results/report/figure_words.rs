@@ -141,6 +141,7 @@ pub(super) const RUN_WORDS: &[Words] = words! {
     frames_tracked: Tracking, Format::Count, "Frames tracked", "Frames that have a pose. All of them is best.";
     frames_tracked_later: Tracking, Format::Count, "Frames tracked afterwards", "Of them those from before the map began, aligned to it afterwards.";
     frames_degraded: Tracking, Format::Count, "Frames with a degraded pose", "Frames whose pose is worse than it should be: few points, blur. Few is good.";
+    frames_withdrawn: Tracking, Format::Count, "Frames withdrawn", "Tracked frames whose keyframe was rejected afterwards: trajectory.txt leaves them out. 0 is good.";
     frames_initializing: Tracking, Format::Count, "Frames before the map", "Frames without a pose because the map could not be trusted yet.";
     frames_lost: Tracking, Format::Count, "Frames lost", "Frames without a pose because tracking was lost. 0 is good.";
     lost_count: Tracking, Format::Count, "Losses", "How often tracking was lost. 0 is good.";
